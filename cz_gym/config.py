@@ -19,7 +19,8 @@ from cz_gym.episodes.scenario import Range, Scenario
 from cz_gym.episodes.scenarios import RANDOMIZED, find_distribution, find_scenario, mix_of
 from cz_gym.errors import CzError
 from cz_gym.jit.code_hash import function_hash
-from cz_gym.machine.puller import DEFAULT, PullerFile, find_puller, on
+from cz_gym.machine.adapt import adapt_scenario
+from cz_gym.machine.puller import DEFAULT, PullerFile, find_puller
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters, check_parameters
 from cz_gym.support.names import needs, unknown
@@ -139,7 +140,7 @@ class Config:
 
     def with_scenario(self, scenario: AnyScenario) -> Config:
         """The same settings on another scenario or mixture."""
-        return replace(self, scenario=on(self.puller, find_distribution(scenario)))
+        return replace(self, scenario=adapt_scenario(self.puller, find_distribution(scenario)))
 
 
 def check_config(config: Config) -> Config:
@@ -167,7 +168,7 @@ def make_config(
     machine = find_puller(puller)
     if puller is not None and parameters is not None:
         raise CzError(f"parameters are those of the puller {machine.name!r}: give one of both")
-    drawn_from = on(machine, find_distribution(scenario))
+    drawn_from = adapt_scenario(machine, find_distribution(scenario))
     mix_of(model, drawn_from)
     if not isinstance(observation, str) or observation not in (*OBSERVATIONS, CAMERA):
         raise CzError(unknown("observation", observation, [*OBSERVATIONS, CAMERA]))

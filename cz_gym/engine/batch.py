@@ -25,13 +25,13 @@ from cz_gym.camera.image import build_look
 from cz_gym.camera.view import IMAGE, make_view
 from cz_gym.config import Config, Identity
 from cz_gym.episodes.mixture import Distribution
-from cz_gym.episodes.record import GRID, Lots, lots_of
-from cz_gym.episodes.scenario import MAX_LATENCY
+from cz_gym.episodes.record import GRID, ScenarioTable, scenario_table
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import entry
-from cz_gym.machine.puller import on
+from cz_gym.machine.adapt import adapt_scenario
 from cz_gym.observation import HISTORY, LAGGED, lags
 from cz_gym.physics.parameters import Parameters
+from cz_gym.physics.quantities import MAX_LATENCY
 
 from .buffers import BufferPool
 from .kernels import build_kernels
@@ -102,7 +102,7 @@ class Batch:
             np.zeros((num_envs, frames, 3)),
         )
         self.memory.slots["over"] = 1
-        self._lots = lots_of(config.scenario, config.model)
+        self._lots = scenario_table(config.scenario, config.model)
         self.scenarios, self._drawn = np.full(num_envs, "", object), slots["scenario"]
         self._parameters = Parameters(*map(float, config.parameters))
         self.actions = np.zeros((num_envs, 2))
@@ -170,8 +170,8 @@ class Batch:
 
         A puller without a finite operating point is drawn again; ValueError if none is found.
         """
-        given = None if given is None else on(self.config.puller, given)
-        lots = self._lots if given is None else lots_of(given, self.config.model)
+        given = None if given is None else adapt_scenario(self.config.puller, given)
+        lots = self._lots if given is None else scenario_table(given, self.config.model)
         slots = np.array(which, np.int64)
         words = np.array(list(keys), np.uint64).reshape(-1, 2)
         arguments = self._drawing(slots, words, lots, out)
@@ -183,7 +183,7 @@ class Batch:
         if self._camera:
             self._photograph(out, np.isin(np.arange(self.num_envs), slots))
 
-    def _drawing(self, which: Any, keys: Any, lots: Lots, out: Out) -> tuple[Any, ...]:
+    def _drawing(self, which: Any, keys: Any, lots: ScenarioTable, out: Out) -> tuple[Any, ...]:
         """Arguments of the compiled draw, without the range of slots."""
         return self.memory, which, keys, lots, self._parameters, self.clock, self.scales, out
 

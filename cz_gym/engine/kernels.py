@@ -205,7 +205,7 @@ def build_kernels(meniscus: MeniscusModel) -> Kernels:
             slot, numbers = memory.slots[i], memory.numbers[i]
             slot.key[0], slot.key[1] = keys[at, 0], keys[at, 1]
             seed_streams(slot.streams, slot.key)
-            slot.scenario = draw_scenario(lots.upto, slot.key)
+            slot.scenario = draw_scenario(lots.cumulative_share, slot.key)
             record, mix = lots.records[slot.scenario], lots.mixes[slot.scenario]
             tries, sound = 0, False
             while not sound and tries < TRIES:

@@ -5,8 +5,6 @@ Scalars come first on each stream, and the noise of each step after them (:mod:`
 horizon extends a draw and never changes it.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -22,7 +20,7 @@ from .scenario import DRAW_SPAN, MAX_FLAGGED
 STREAMS = len(Stream)
 _NUMBERS = tuple(map(stream_number, range(STREAMS)))
 SHORTEST = 1e-9
-"""Least length of a ramp [s]; one of zero length is a jump."""
+"""Least duration of a ramp [s]; one of zero duration is a jump."""
 _START, _PARAMETERS, _SCHEDULE = int(Stream.START), int(Stream.PARAMETERS), int(Stream.SCHEDULE)
 _INTERFACE, _SENSOR, _FAULTS = int(Stream.INTERFACE), int(Stream.SENSOR), int(Stream.FAULTS)
 _SPREAD_NUMBERS, _HOT_ZONE_NUMBERS, _FAULT_NUMBERS = 7, 7, 5 + 3 * FREEZES
@@ -58,14 +56,14 @@ def _varies(limits: Any) -> Any:
 
 
 @jittable
-def draw_scenario(upto: Any, key: Any) -> Any:
-    """Index of the scenario that an episode is drawn from; ``upto``: running sums of the scenarios' shares."""
+def draw_scenario(cumulative_share: Any, key: Any) -> Any:
+    """Index of the scenario that an episode is drawn from, by the running sums of the scenarios' shares."""
     index = 0
-    if upto.size > 1:
+    if cumulative_share.size > 1:
         stream = np.zeros(WORDS, np.uint64)
         seed_stream(stream, key, MIXTURE_STREAM)
         u = uniform(stream)
-        while index < upto.size - 1 and u >= upto[index]:
+        while index < cumulative_share.size - 1 and u >= cumulative_share[index]:
             index += 1
     return index
 
@@ -120,54 +118,41 @@ def draw_episode(record: Any, streams: Any, freezes: Any) -> Any:
     sensor, drives = record.sensor, record.actuators
     plan, read = _uniforms(streams[_SCHEDULE], 10), _uniforms(streams[_SENSOR], 8)
     at = _uniforms(streams[_INTERFACE], 2)
-    recipe_length = between(recipe.duration, plan[1])
+    recipe_duration = between(recipe.duration, plan[1])
     moved = 1.0 if plan[6] < reference.probability else 0.0
     sd_fast, sd_slow = between(record.interface.sd, at[0]), between(record.interface.sd, at[1])
     keep_fast, keep_slow = np.exp(-GRID / record.interface.tau_fast), np.exp(-GRID / record.interface.tau_slow)
     fault = _draw_faults(record.faults, streams[_FAULTS], freezes)
+    r_c_start = record.pullers.start_radius_sd * normal(streams[_START])
+    slow = _uniforms(streams[_START], 3)
     return Episode(
-        r_c_start=record.pullers.start_radius_sd * normal(streams[_START]),
-        recipe_start=between(recipe.start, plan[2]),
-        recipe_duration=max(recipe_length, SHORTEST),
-        recipe_amount=between(recipe.rate, plan[0]) * recipe_length,
-        drift_start=between(drift.start, plan[5]),
-        drift_duration=max(between(drift.duration, plan[4]), SHORTEST),
-        drift_amount=between(drift.amount, plan[3]),
-        drift_rate=drift.rate,
+        r_c_start=r_c_start, melt_loss=record.pullers.melt_loss,
+        recipe_start=between(recipe.start, plan[2]), recipe_duration=max(recipe_duration, SHORTEST),
+        recipe_amount=between(recipe.rate, plan[0]) * recipe_duration,
+        drift_start=between(drift.start, plan[5]), drift_duration=max(between(drift.duration, plan[4]), SHORTEST),
+        drift_amount=between(drift.amount, plan[3]), drift_rate=drift.rate,
         reference_start=between(reference.start, plan[9]),
         reference_duration=max(between(reference.duration, plan[8]), SHORTEST),
         reference_amount=between(reference.amount, plan[7]) * moved,
-        melt_loss=record.pullers.melt_loss,
         ring_offset=between(sensor.bias_offset, read[2]) + between(sensor.level_offset, read[3]),
-        bias_drift_start=fault[0],
-        bias_drift_duration=fault[1],
-        bias_drift_amount=fault[2],
+        bias_drift_start=fault[0], bias_drift_duration=fault[1], bias_drift_amount=fault[2], dropout=fault[3],
         ripple_amplitude=between(sensor.ripple, read[4]),
-        ripple_omega=2.0 * math.pi * between(sensor.rotation, read[5]),
-        ripple_phase=2.0 * math.pi * read[6],
+        ripple_omega=2.0 * math.pi * between(sensor.rotation, read[5]), ripple_phase=2.0 * math.pi * read[6],
+        camera_sd=between(sensor.camera_noise, read[0]), pyrometer_sd=between(sensor.pyrometer_noise, read[1]),
         pyrometer_drift=between(sensor.pyrometer_drift, read[7]),
-        latency=sensor.latency,
-        pull_window=drives.pull_window,
-        pull_slew=drives.pull_slew,
-        heater_slew=drives.heater_slew,
-        heater_step=drives.heater_step,
-        sd_fast=sd_fast,
-        sd_slow=sd_slow,
-        keep_fast=keep_fast,
-        keep_slow=keep_slow,
-        kick_fast=np.sqrt(1.0 - keep_fast**2),
-        kick_slow=np.sqrt(1.0 - keep_slow**2),
-        camera_sd=between(sensor.camera_noise, read[0]),
-        pyrometer_sd=between(sensor.pyrometer_noise, read[1]),
-        dropout=fault[3],
-        outlier_probability=sensor.outlier_probability,
-        outlier_sd=sensor.outlier_sd,
-    )
+        pyrometer_filter=between(sensor.pyrometer_filter, slow[2]),
+        latency=sensor.latency, outlier_probability=sensor.outlier_probability, outlier_sd=sensor.outlier_sd,
+        pull_window=drives.pull_window, pull_slew=drives.pull_slew,
+        heater_slew=drives.heater_slew, heater_step=drives.heater_step,
+        heater_lag=between(drives.heater_lag, slow[0]), heater_dead_time=between(drives.heater_dead_time, slow[1]),
+        sd_fast=sd_fast, sd_slow=sd_slow, keep_fast=keep_fast, keep_slow=keep_slow,
+        kick_fast=np.sqrt(1.0 - keep_fast**2), kick_slow=np.sqrt(1.0 - keep_slow**2),
+    )  # fmt: skip
 
 
 @jittable
 def _draw_faults(faults: Any, s: Any, freezes: Any) -> Any:
-    """Place the freezes; return start [s], length [s] and size [m] of the ring's drift, and the drop-outs' share."""
+    """Place the freezes; return start [s], duration [s] and size [m] of the ring's drift, and the drop-outs' share."""
     u = _uniforms(s, _FAULT_NUMBERS)
     least, most = faults.flagged[0], faults.flagged[1]
     flagged = min(most, least + np.floor(u[3] * (most - least + 1.0)))

@@ -1,7 +1,5 @@
 """Several scenarios at once: each episode is drawn from one of them."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,8 +1,5 @@
 """A scenario as one record for the compiled draws, and the constants of a drawn episode."""
 
-from __future__ import annotations
-
-import dataclasses
 import math
 from enum import IntEnum
 from functools import lru_cache
@@ -12,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .mixture import Distribution
-from .scenario import MAX_FLAGGED, MAX_UNFLAGGED, Scenario
+from .scenario import FAMILIES, MAX_FLAGGED, MAX_UNFLAGGED
 from .scenarios import mix_of
 
 GRID = 5.0
@@ -49,80 +46,63 @@ def stream_number(index: int) -> int:
 
 
 class Episode(NamedTuple):
-    """The constants of an episode's ramps, sensors and drives; every field is a float."""
+    """The constants of a drawn episode, floats in SI units.
+
+    A field with the name of a scenario's member is that number, or the number drawn from its range.
+    """
 
     r_c_start: float = 0.0
     """r_c(0) - r_0 [m]."""
     recipe_start: float = 0.0
-    """Start of the recipe error's ramp [s]."""
     recipe_duration: float = 1.0
-    """Its length [s]."""
     recipe_amount: float = 0.0
-    """Its final value [K]."""
+    """Ramp of the recipe's error: start [s], duration [s], final value [K]."""
     drift_start: float = 0.0
-    """Start of the hot zone's drift [s]."""
     drift_duration: float = 1.0
-    """Its length [s]."""
     drift_amount: float = 0.0
-    """Its final value [K]."""
+    """Ramp of the hot zone's drift: start [s], duration [s], final value [K]."""
     drift_rate: float = 0.0
-    """Steady drift on top [K/s]."""
+    """Steady rate of the hot zone's drift, on top of the ramp [K/s]."""
     reference_start: float = 0.0
-    """Start of the reference change [s]."""
     reference_duration: float = 1.0
-    """Its length [s]."""
     reference_amount: float = 0.0
-    """The change [m]."""
+    """Change of the reference: start [s], duration [s], size [m]."""
     melt_loss: float = 0.0
-    """Share of the melt's heat capacity lost over 3 h [-]."""
     ring_offset: float = 0.0
-    """Constant offset of the ring [m]."""
+    """Constant offset of the ring, from bias and melt level [m]."""
     bias_drift_start: float = 0.0
-    """Start of the ring's drift [s]."""
     bias_drift_duration: float = 1.0
-    """Its length [s]."""
     bias_drift_amount: float = 0.0
-    """Its final value [m]."""
+    """Ramp of the ring's drift: start [s], duration [s], final value [m]."""
     ripple_amplitude: float = 0.0
-    """Amplitude of the ring's ripple [m]."""
     ripple_omega: float = 0.0
-    """Its angular frequency [rad/s]."""
     ripple_phase: float = 0.0
-    """Its phase at t = 0 [rad]."""
+    """Ripple of the ring: amplitude [m], angular frequency [rad/s], phase at t = 0 [rad]."""
     pyrometer_drift: float = 0.0
-    """Drift of the pyrometer over 3 h [K]."""
     latency: float = 0.0
-    """Age of the newest camera frame [s]."""
     pull_window: float = math.inf
-    """Largest |v_p - v_0| [m/s]."""
     pull_slew: float = math.inf
-    """Largest |dv_p/dt| [m/s2]."""
     heater_slew: float = math.inf
-    """Largest |dQ_H/dt| [W/s]."""
     heater_step: float = 0.0
-    """Resolution of the heater [W]."""
     sd_fast: float = 0.0
-    """Standard deviation of the interface's fast fluctuation [K]."""
     sd_slow: float = 0.0
-    """Standard deviation of its slow fluctuation [K]."""
+    """Standard deviations of the interface's fast and slow fluctuation [K]."""
     keep_fast: float = 0.0
-    """Factor of the fast fluctuation over one interval of the grid [-]."""
     keep_slow: float = 0.0
-    """The same of the slow fluctuation [-]."""
+    """Factors of the two fluctuations over one interval of the grid [-]."""
     kick_fast: float = 0.0
-    """Standard deviation of the fast fluctuation's new part, sqrt(1 - keep_fast^2) [-]."""
     kick_slow: float = 0.0
-    """The same of the slow fluctuation [-]."""
+    """Standard deviations of the two fluctuations' new parts, sqrt(1 - keep^2) [-]."""
     camera_sd: float = 0.0
     """Standard deviation of the ring's white noise [m]."""
     pyrometer_sd: float = 0.0
     """Standard deviation of the pyrometer's white noise [K]."""
     dropout: float = 0.0
-    """Probability that a sample drops out [-]."""
     outlier_probability: float = 0.0
-    """Probability that a sample carries an outlier [-]."""
     outlier_sd: float = 0.0
-    """Standard deviation of an outlier [m]."""
+    heater_lag: float = 0.0
+    heater_dead_time: float = 0.0
+    pyrometer_filter: float = 0.0
 
 
 class Factors(NamedTuple):
@@ -140,40 +120,35 @@ class Factors(NamedTuple):
     C_b: float = 1.0
 
 
-def _members(scenario: Scenario) -> list[tuple[str, dict[str, Any]]]:
-    """Each family of a scenario and its members, by name."""
-    return [(family.name, vars(getattr(scenario, family.name))) for family in dataclasses.fields(Scenario)[1:]]
-
-
-def _record(members: dict[str, Any]) -> np.dtype[Any]:
-    return np.dtype([(name, np.float64, (2,) if isinstance(value, tuple) else ()) for name, value in members.items()])
-
-
-RECORD = np.dtype([(family, _record(members)) for family, members in _members(Scenario("plain"))])
+RECORD = np.dtype(
+    [
+        (family, [(name, np.float64, np.shape(value)) for name, value in vars(kind()).items()])
+        for family, kind in FAMILIES.items()
+    ]
+)
 """A scenario as a record for the compiled draws: families of numbers and pairs."""
 
 
-class Lots(NamedTuple):
+class ScenarioTable(NamedTuple):
     """Scenarios as read-only arrays for the compiled draws, one row a scenario."""
 
     records: npt.NDArray[Any]
     """The scenarios' numbers: records of :data:`RECORD`."""
     mixes: npt.NDArray[np.float64]
     """Range of the share of conduction [-], shape (scenarios, 2)."""
-    upto: npt.NDArray[np.float64]
+    cumulative_share: npt.NDArray[np.float64]
     """Running sums of the scenarios' shares [-]."""
 
 
 @lru_cache(maxsize=64)
-def lots_of(distribution: Distribution, model: str | float | None = None) -> Lots:
+def scenario_table(distribution: Distribution, model: str | float | None = None) -> ScenarioTable:
     """The numbers of a scenario, or of each scenario of a mixture, under the environment's ``model`` argument."""
     records = np.zeros(len(distribution.scenarios), RECORD)
     for row, scenario in enumerate(distribution.scenarios):
-        for family, members in _members(scenario):
-            for member, value in members.items():
-                records[family][member][row] = value
+        for family, each, value in scenario.members:
+            records[family][each.name][row] = value
     mixes = np.array([mix_of(model, scenario) for scenario in distribution.scenarios], np.float64)
-    lots = Lots(records, mixes, np.cumsum(distribution.shares))
-    for array in lots:
+    table = ScenarioTable(records, mixes, np.cumsum(distribution.shares))
+    for array in table:
         array.setflags(write=False)
-    return lots
+    return table

@@ -1,7 +1,5 @@
 """The named scenarios, frozen: the distributions every controller and agent meets."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from numbers import Real
@@ -109,32 +107,20 @@ HOT_ZONE = replace(
 )
 
 _ONE_FAMILY = (
-    Scenario("only-recipe", recipe=RANDOMIZED.recipe),
-    Scenario("only-drift", drift=RANDOMIZED.drift),
-    Scenario("only-interface", interface=RANDOMIZED.interface),
-    Scenario("only-sensor", sensor=RANDOMIZED.sensor),
-    Scenario("only-reference", reference=RANDOMIZED.reference),
+    *(Scenario(f"only-{family}", **{family: getattr(RANDOMIZED, family)})
+      for family in ("recipe", "drift", "interface", "sensor", "reference")),
     Scenario("only-parameters", pullers=RANDOMIZED.pullers),
-)
+)  # fmt: skip
 
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
     for scenario in (
-        NOMINAL,
-        PAPER_RAMP,
-        REFERENCE_A,
-        REFERENCE_B,
-        RANDOMIZED,
-        HARD,
-        SENSOR_FAULT,
-        PULLER,
-        HOT_ZONE,
-        *_ONE_FAMILY,
+        NOMINAL, PAPER_RAMP, REFERENCE_A, REFERENCE_B, RANDOMIZED, HARD, SENSOR_FAULT, PULLER, HOT_ZONE, *_ONE_FAMILY,
     )
-}
+}  # fmt: skip
 """Every named scenario."""
 ALIASES = {"unknown-puller": PULLER.name}
-"""Other names of scenarios: the puller's true numbers, camera and drives are not what controllers were told."""
+"""Aliases of scenario names. In unknown-puller, hot zone, camera and drives are not what controllers were told."""
 ALL = make_mixture([(RANDOMIZED, 0.3), *((each, 0.175) for each in (HARD, SENSOR_FAULT, PULLER, HOT_ZONE))])
 """The mixture "all": every random scenario of the benchmark's default table."""
 

@@ -5,8 +5,6 @@ from the episode's own streams (:mod:`cz_gym.episodes.noise`): the environment d
 whole series.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +15,7 @@ from cz_gym.jit.compile import kernel
 from . import draw as draws
 from .draw import STREAMS, seed_streams
 from .noise import draw_series
-from .record import FREEZES, Episode, Factors, lots_of
+from .record import FREEZES, Episode, Factors, scenario_table
 from .rng import WORDS
 from .scenario import Range, Scenario
 
@@ -42,12 +40,12 @@ def new_series(grid_points: int, samples: int) -> Series:
 
 def draw_factors(scenario: Scenario, mix: Range, key: tuple[int, int]) -> Factors:
     """Draw the puller; ``mix`` is the range of the share of conduction [-]."""
-    return Factors(*_factors(lots_of(scenario).records, np.array(mix, np.float64), np.array(key, np.uint64)))
+    return Factors(*_factors(scenario_table(scenario).records, np.array(mix, np.float64), np.array(key, np.uint64)))
 
 
 def draw_episode(scenario: Scenario, key: tuple[int, int], out: Series) -> Episode:
     """Draw an episode: ramps and constants are returned, series written into ``out``."""
-    return Episode(*_episode(lots_of(scenario).records, np.array(key, np.uint64), *out))
+    return Episode(*_episode(scenario_table(scenario).records, np.array(key, np.uint64), *out))
 
 
 @kernel

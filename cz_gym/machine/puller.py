@@ -1,158 +1,76 @@
 """A puller as a file: its numbers in TOML, with the unit in every key.
 
-:data:`KEYS` is the one table of keys: reader, writer, errors and the page's table follow from it. A number is read
-exactly (decimal text times the unit's size, rounded once), and written with the fewest digits that read back the same.
+Keys are those of :data:`cz_gym.physics.quantities.MACHINE`, from which reader, writer, errors and the page's table
+follow.
 """
-
-from __future__ import annotations
 
 import hashlib
 import json
 import math
 import sys
-import tomllib
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
-from decimal import Context, Decimal
-from fractions import Fraction
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from cz_gym.body.plant import make_puller
 from cz_gym.body.task import HEATER_RANGE, RADIUS_LIMIT, check_height
-from cz_gym.episodes.mixture import Distribution, Mixture
-from cz_gym.episodes.scenario import MAX_LATENCY, Range, Scenario
+from cz_gym.episodes.scenario import Range
 from cz_gym.errors import CzError
 from cz_gym.physics.parameters import Parameters, check_parameters
+from cz_gym.physics.quantities import MACHINE, Quantity
 from cz_gym.support.atomic_files import naming, write_files
 from cz_gym.support.names import unknown
-from cz_gym.support.plausible import IN_MM, IN_MM_PER_MIN, IN_MM_PER_MIN2
-from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN, PERCENT
+from cz_gym.support.units import CELSIUS, KILO, MM
 
-FORMAT = 1
-"""Version of the file format."""
+from .toml_numbers import FORMAT, read_numbers, write_numbers
+
 FOLDER = Path(__file__).parent / "pullers"
 """Folder of the files that ship."""
-
-
-UNITS: dict[str, tuple[float, tuple[tuple[str, float, float], ...]]] = {
-    "mm": (MM, (("m", 1e3, 0.0), ("µm", 1e-3, 0.0))),
-    "mm_per_min": (MM_PER_MIN, (("mm/h", 1.0 / MINUTE, 0.0), ("m/s", 1.0 / MM_PER_MIN, 0.0))),
-    "mm_per_min2": (MM_PER_MIN / MINUTE, (("mm/s2", MINUTE * MINUTE, 0.0),)),
-    "deg": (math.pi / 180.0, (("rad", 180.0 / math.pi, 0.0),)),
-    "K": (1.0, (("°C", 1.0, 273.15),)),
-    "s": (1.0, (("ms", 1e-3, 0.0), ("min", MINUTE, 0.0))),
-    "rpm": (1.0 / MINUTE, (("rev/s", MINUTE, 0.0),)),
-    "percent": (PERCENT, ()),
-    "kW": (KILO, (("W", 1e-3, 0.0), ("MW", 1e3, 0.0))),
-    "W": (1.0, (("kW", KILO, 0.0),)),
-    "kW_per_min": (KILO / MINUTE, (("W/s", MINUTE / KILO, 0.0),)),
-    "N_per_m": (1.0, (("mN/m", 1e-3, 0.0),)),
-    "kg_per_m3": (1.0, (("g/cm3", KILO, 0.0),)),
-    "J_per_kg": (1.0, (("kJ/kg", KILO, 0.0),)),
-    "J_per_K": (1.0, (("kJ/K", KILO, 0.0),)),
-    "W_per_K": (1.0, (("kW/K", KILO, 0.0),)),
-    "W_per_mK": (1.0, (("W/cm/K", 100.0, 0.0),)),
-    "W_per_K4": (1.0, ()),
-    "W_per_m2K4": (1.0, ()),
-    "m_per_s2": (1.0, ()),
-    "": (1.0, (("%", PERCENT, 0.0),)),
-}
-"""Units of keys, by the keys' endings: the size in SI units, and units that users may have meant instead, each with its
-name, its factor and its offset to this one."""
-
-
-class Key(NamedTuple):
-    """A number of the file."""
-
-    table: str
-    stem: str
-    """The key without its unit."""
-    unit: str
-    """Its ending, of :data:`UNITS`."""
-    low: float
-    """Smallest plausible value, in the key's unit."""
-    high: float
-    """Largest plausible value."""
-    field: str
-    """Its name in :class:`PullerFile`, or in Parameters."""
-    drawn: bool = False
-    """Whether each crystal draws its own number from a range."""
-
-    @property
-    def name(self) -> str:
-        """The key as it stands in the file."""
-        return f"{self.stem}_{self.unit}" if self.unit else self.stem
-
-    @property
-    def size(self) -> Fraction:
-        """Size of the unit in SI units."""
-        return Fraction(UNITS[self.unit][0])
-
-
-def number(
-    table: str, unit: str, low: float, high: float, default: Any = None, drawn: bool = False, stem: str = ""
-) -> Any:
-    """A number of a puller, with its :class:`Key` in the file, whose stem is the field's name unless one is given."""
-    return field(default=default, metadata={"key": Key(table, stem, unit, low, high, "", drawn)})
+HOTTEST = 3300.0
+"""Temperature that graphite heaters stand in inert gas [K]."""
+MELT_HEAT = 2.5e6
+"""Heat capacity of a melt's volume [J/m3/K]: that of silicon, germanium and gallium arsenide, within 15 %."""
 
 
 @dataclass(frozen=True)
 class PullerFile:
     """A machine: its operating point and hot zone, its drives, its sensors, and how its melt usually fluctuates.
 
-    A number that is None is the scenario's, lengths relative to r_0, speeds to v_0, powers to the heater's range. A
-    pair is a range, drawn from anew for each crystal. CzError for numbers that are not plausible, impossible geometry,
-    and drives that exclude the operating point.
+    The page on puller files has each number's meaning and range; here they are in SI units. A number that is None is
+    the scenario's, lengths relative to r_0, speeds to v_0, powers to the heater's range. A pair is a range, drawn from
+    anew for each crystal. CzError for numbers that are not plausible, impossible geometry, and drives that exclude the
+    operating point.
     """
 
     name: str = "default"
     parameters: Parameters = field(default_factory=Parameters)
-    heater_range: float = number("drives", "kW", 0.05, 500.0, HEATER_RANGE)
-    """Largest |Q_H - Q_H0|: what an action of 1 moves the heater by [W]"""
-    heater_max: float | None = number("drives", "kW", 0.1, 5e3)
-    """Largest power that the heater can have; narrows its range [W]"""
-    heater_slew: float | None = number("drives", "kW_per_min", 0.01, 1e3)
-    """Largest rate of change of the heater power [W/s]"""
-    heater_step: float | None = number("drives", "W", 0.0, 1e4)
-    """Resolution of the heater power [W]"""
-    pull_max: float | None = number("drives", "mm_per_min", 0.01, 60.0)
-    """Largest pull speed; narrows its window [m/s]"""
-    pull_window: float | None = number("drives", "mm_per_min", 0.001, 60.0)
-    """Largest |v_p - v_0| [m/s]"""
-    pull_slew: float | None = number("drives", "mm_per_min2", 0.001, 600.0)
-    """Largest rate of change of the pull speed [m/s2]"""
-    control_interval: float = number("sensors", "s", 0.1, 60.0, 5.0, stem="interval")
-    """Time between actions [s]"""
-    camera_noise: Range | None = number("sensors", "mm", 0.0, 2.0, drawn=True)
-    """Standard deviation of the white noise on the ring [m]"""
-    pyrometer_noise: Range | None = number("sensors", "K", 0.0, 100.0, drawn=True)
-    """Standard deviation of the white noise on T_1 [K]"""
-    pyrometer_drift: Range | None = number("sensors", "K", -100.0, 100.0, drawn=True)
-    """Drift of the pyrometer over 3 h [K]"""
-    bias_offset: Range | None = number("sensors", "mm", -5.0, 5.0, drawn=True)
-    """Constant offset of the ring from a wrong bias [m]"""
-    level_offset: Range | None = number("sensors", "mm", -5.0, 5.0, drawn=True)
-    """Constant offset of the ring from the melt level [m]"""
-    ripple: Range | None = number("sensors", "mm", 0.0, 5.0, drawn=True)
-    """Amplitude of the rotation-synchronous ripple [m]"""
-    rotation: Range | None = number("sensors", "rpm", 0.0, 100.0, drawn=True)
-    """Crystal rotation [rev/s]"""
-    latency: float | None = number("sensors", "s", 0.0, MAX_LATENCY)
-    """Age of the newest camera frame [s]"""
-    outlier_probability: float | None = number("sensors", "percent", 0.0, 100.0)
-    """Share of samples that carry an outlier [-]"""
-    outlier_sd: float | None = number("sensors", "mm", 0.0, 5.0)
-    """Standard deviation of an outlier [m]"""
-    fluctuation_sd: Range | None = number("melt", "K", 0.0, 100.0, drawn=True)
-    """Standard deviation of the fast and of the slow fluctuation of the melt, each drawn on its own [K]"""
-    tau_fast: float | None = number("melt", "s", 0.1, 1e5)
-    """Correlation time of the fast one [s]"""
-    tau_slow: float | None = number("melt", "s", 0.1, 1e6)
-    """Correlation time of the slow one [s]"""
+    heater_range: float = HEATER_RANGE
+    heater_max: float | None = None
+    heater_slew: float | None = None
+    heater_step: float | None = None
+    heater_lag: Range | None = None
+    heater_dead_time: Range | None = None
+    pull_max: float | None = None
+    pull_window: float | None = None
+    pull_slew: float | None = None
+    control_interval: float = 5.0
+    camera_noise: Range | None = None
+    pyrometer_noise: Range | None = None
+    pyrometer_drift: Range | None = None
+    bias_offset: Range | None = None
+    level_offset: Range | None = None
+    ripple: Range | None = None
+    rotation: Range | None = None
+    latency: float | None = None
+    outlier_probability: float | None = None
+    outlier_sd: float | None = None
+    pyrometer_filter: Range | None = None
+    fluctuation_sd: Range | None = None
+    tau_fast: float | None = None
+    tau_slow: float | None = None
     missing: tuple[str, ...] = field(default=(), compare=False, repr=False)
     """Keys that its file does not have: they keep the default's value."""
     file: Path | None = field(default=None, compare=False, repr=False)
@@ -161,29 +79,42 @@ class PullerFile:
     def __post_init__(self) -> None:
         if not (isinstance(self.name, str) and self.name.strip() and len(self.name) <= 80 and self.name.isprintable()):
             raise CzError(f"a puller's name must be up to 80 printable characters, not {self.name!r:.100}")
-        for key in KEYS:
-            _check(key, value_of(self, key))
+        for quantity in MACHINE.values():
+            _check(self, quantity)
         object.__setattr__(self, "parameters", check_parameters(self.parameters))
         plant = make_puller(self.parameters)
         check_height(plant)
-        highest, fastest = self.heater_max, self.pull_max
-        if highest is not None and highest <= plant.Q_H_0:
+        for symbol, needed, which in (
+            ("heater_max", plant.Q_H_0, "which needs"),
+            ("pull_max", plant.v_0, "whose pull speed is"),
+        ):
+            limit, most = getattr(self, symbol), MACHINE[symbol]
+            if limit is not None and limit <= needed:
+                point = f"the operating point, {which} {needed / most.size:.4g} {most.shown}"
+                raise CzError(f"{most.key} = {limit / most.size:g} excludes {point}")
+        if plant.T_1_0 > HOTTEST:
             raise CzError(
-                f"heater_max_kW = {highest / KILO:g} excludes the operating point, "
-                f"which needs {plant.Q_H_0 / KILO:.4g} kW"
+                f"the heater would have to be at {plant.T_1_0:.0f} K, and none stands more than {HOTTEST:.0f} K: "
+                f"check T_m_K = {self.parameters.T_m:g}, T_e_K, G_2b_W_per_K and kappa_12_W_per_K4"
             )
-        if fastest is not None and fastest <= plant.v_0:
+        if (step := self.heater_step or 0.0) >= self.power_range:
             raise CzError(
-                f"pull_max_mm_per_min = {fastest / MM_PER_MIN:g} excludes the operating point, "
-                f"whose pull speed is {plant.v_0 / MM_PER_MIN:.4g} mm/min"
+                f"heater_step_W = {step:g} is no less than the heater's range, {self.power_range / KILO:g} kW"
             )
 
     @cached_property
     def hash(self) -> str:
         """SHA-256 of everything but the name (16 hex digits)."""
-        numbers = [value_of(self, key) for key in KEYS]
-        plain = [value if value is None else (np.asarray(value, float) + 0.0).tolist() for value in numbers]
-        return hashlib.sha256(json.dumps([FORMAT, plain]).encode()).hexdigest()[:16]
+        plain, later = [], {}
+        for quantity in MACHINE.values():
+            value = value_of(self, quantity)
+            value = value if value is None else (np.asarray(value, float) + 0.0).tolist()
+            if not quantity.later:
+                plain.append(value)
+            elif value is not None:
+                later[quantity.symbol] = value
+        contents = [FORMAT, plain, *([later] if later else [])]
+        return hashlib.sha256(json.dumps(contents).encode()).hexdigest()[:16]
 
     @property
     def label(self) -> str:
@@ -213,55 +144,21 @@ class PullerFile:
         return RADIUS_LIMIT * self.scale
 
 
-_PARAMETERS = (
-    Key("crystal", "radius", "mm", 2.0, 500.0, "r_0"),
-    Key("crystal", "pull_speed", "mm_per_min", 0.005, 30.0, "v_0"),
-    Key("crystal", "sigma", "N_per_m", 0.01, 5.0, "sigma"),
-    Key("crystal", "rho_l", "kg_per_m3", 100.0, 3e4, "rho_l"),
-    Key("crystal", "rho_s", "kg_per_m3", 100.0, 3e4, "rho_s"),
-    Key("crystal", "alpha_0", "deg", 0.0, 60.0, "alpha_0"),
-    Key("crystal", "k_l", "W_per_mK", 0.1, 1e3, "k_l"),
-    Key("crystal", "dH", "J_per_kg", 1e4, 1e8, "dH"),
-    Key("crystal", "T_m", "K", 200.0, 5e3, "T_m"),
-    Key("hot_zone", "dT_0", "K", 0.01, 500.0, "dT_0"),
-    Key("hot_zone", "C_1", "J_per_K", 500.0, 1e8, "C_1"),
-    Key("hot_zone", "C_2", "J_per_K", 500.0, 1e8, "C_2"),
-    Key("hot_zone", "C_b", "J_per_K", 500.0, 1e8, "C_b"),
-    Key("hot_zone", "kappa_12", "W_per_K4", 1e-12, 1e-5, "kappa_12"),
-    Key("hot_zone", "G_1a", "W_per_K", 0.01, 1e5, "G_1a"),
-    Key("hot_zone", "T_a", "K", 200.0, 2e3, "T_a"),
-    Key("hot_zone", "G_2b", "W_per_K", 0.01, 1e5, "G_2b"),
-    Key("hot_zone", "eps", "", 1e-3, 1.0, "eps"),
-    Key("hot_zone", "R_cr", "mm", 5.0, 2e3, "R_cr"),
-    Key("hot_zone", "T_e", "K", 0.0, 5e3, "T_e"),
-    Key("hot_zone", "g", "m_per_s2", 1e-3, 100.0, "g"),
-    Key("hot_zone", "sigma_SB", "W_per_m2K4", 1e-9, 1e-6, "sigma_SB"),
-    Key("sensors", "phi_b", "deg", 0.01, 60.0, "phi_b"),
-)
-_OWN = [
-    (key := each.metadata["key"])._replace(stem=key.stem or each.name, field=each.name)
-    for each in fields(PullerFile) if each.metadata
-]  # fmt: skip
-_SENSORS = [key.table for key in _OWN].index("sensors") + 1
-KEYS = (*_PARAMETERS[:-1], *_OWN[:_SENSORS], _PARAMETERS[-1], *_OWN[_SENSORS:])
-"""Every key of the file, in order."""
-TABLES = tuple(dict.fromkeys(key.table for key in KEYS))
-"""Tables of the file."""
-
-
-def value_of(puller: PullerFile, key: Key) -> Any:
-    """The number, or range, of a key [SI units]; None: the scenario's own."""
-    return getattr(puller.parameters if key in _PARAMETERS else puller, key.field)
+def value_of(puller: PullerFile, quantity: Quantity) -> Any:
+    """The number, or range, of a machine's quantity [SI units]; None: the scenario's own."""
+    return getattr(puller.parameters if quantity.symbol in Parameters._fields else puller, quantity.symbol)
 
 
 def read_puller(path: str | Path) -> PullerFile:
     """Read a puller file; CzError, one line that names the file, for anything that cannot be meant."""
     path = Path(path)
     with naming(path):
-        text = path.read_text("utf-8")
+        text = path.read_text("utf-8-sig")
     try:
-        return replace(_puller(tomllib.loads(text, parse_float=Decimal), path.stem), file=path)
-    except (tomllib.TOMLDecodeError, CzError) as error:
+        name, numbers, missing = read_numbers(text)
+        parameters = Parameters(**{symbol: numbers.pop(symbol) for symbol in Parameters._fields if symbol in numbers})
+        return PullerFile(path.stem if name is None else name, parameters, **numbers, missing=missing, file=path)
+    except CzError as error:
         raise CzError(f"{path}: {' '.join(str(error).split())}") from None
 
 
@@ -278,158 +175,77 @@ def find_puller(given: str | Path | PullerFile | None) -> PullerFile:
         raise CzError(
             f"puller must be a puller file, a shipped name or a cz_gym.machine.puller.PullerFile, not {given!r:.80}"
         )
-    shipped = {file.stem: file for file in sorted(FOLDER.glob("*.toml"))}
-    if str(given) in shipped and not Path(given).exists():
-        return read_puller(shipped[str(given)])
-    if Path(given).suffix != ".toml" and not Path(given).exists():
-        raise CzError(unknown("puller", str(given), shipped, ", or a file NAME.toml"))
-    return read_puller(given)
+    shipped, file = {each.stem: each for each in sorted(FOLDER.glob("*.toml"))}, Path(given)
+    if file.suffix != ".toml" and not file.is_file():
+        if str(given) not in shipped:
+            raise CzError(unknown("puller", str(given), shipped, ", or a file NAME.toml"))
+        file = shipped[str(given)]
+    return read_puller(file)
 
 
 def chosen_puller(given: str | None) -> PullerFile:
-    """The puller that a command line names; a line on stderr lists the keys that its file does not have."""
+    """The puller that a command line names; lines on stderr tell of keys that its file lacks, and of doubts."""
     puller = find_puller(given)
     if puller.missing:
         print(f"puller {puller.label}: the default's values for {', '.join(puller.missing)}", file=sys.stderr)
+    for doubt in doubts(puller):
+        print(f"puller {puller.label}: {doubt}", file=sys.stderr)
     return puller
+
+
+def doubts(puller: PullerFile) -> list[str]:
+    """What is possible in a puller but improbable, each in a line that says what may be meant."""
+    q, power, nominal = puller.parameters, puller.power_range, make_puller(puller.parameters).Q_H_0
+    lines = []
+    for each in MACHINE.values():
+        value = value_of(puller, each)
+        if isinstance(value, float) and not each.holds(value, usual=True):
+            usual = each.limits(value, each.shown, usual=True)
+            lines.append(f"{each.key} = {value / each.size:g} is unusual, most are {usual}")
+    crucible, depth = f"R_cr_mm = {q.R_cr / MM:g}", q.C_b / MELT_HEAT / (math.pi * q.R_cr**2)
+    if not 2.0 <= q.R_cr / q.r_0 <= 4.5:
+        lines.append(
+            f"{crucible} is {q.R_cr / q.r_0:.2g} times radius_mm = {q.r_0 / MM:g}, most are 2 to 4.5 times: "
+            "is one of them a diameter, or in another unit?"
+        )
+    if not 0.15 <= depth / q.R_cr <= 2.5:
+        lines.append(
+            f"a melt with C_b_J_per_K = {q.C_b:g} would be {depth / MM:.2g} mm deep in a crucible with {crucible}: "
+            "is that its diameter, or C_b another melt's?"
+        )
+    if q.T_e < 0.65 * q.T_m and 0.7 * q.T_m < q.T_e + CELSIUS < q.T_m:
+        lines.append(f"T_e_K = {q.T_e:g} is unusually cold: did you mean {q.T_e + CELSIUS:g} ({q.T_e:g} °C)?")
+    if (step := puller.heater_step or 0.0) > 0.05 * power:
+        lines.append(f"heater_step_W = {step:g} is a coarse step for a heater's range of {power / KILO:g} kW")
+    if power > nominal:
+        lines.append(
+            f"the heater's range of {power / KILO:g} kW is more than the nominal power, {nominal / KILO:.4g} kW"
+        )
+    return lines
 
 
 def to_toml(puller: PullerFile) -> str:
     """The puller as the text of a file; numbers that are the scenario's own are left out."""
-    lines = [f"format = {FORMAT}", f"name = {json.dumps(puller.name, ensure_ascii=False)}"]
-    for table in TABLES:
-        lines += ["", f"[{table}]"]
-        for key in (each for each in KEYS if each.table == table):
-            value = value_of(puller, key)
-            if value is not None:
-                texts = [_shortest(number, key) for number in (value if isinstance(value, tuple) else (value,))]
-                single = texts[0] if len(set(texts)) == 1 else f"[{', '.join(texts)}]"
-                lines.append(f"{key.name} = {single}")
-    return "\n".join(lines) + "\n"
+    return write_numbers(puller.name, {symbol: value_of(puller, quantity) for symbol, quantity in MACHINE.items()})
 
 
-def _puller(found: Mapping[str, Any], stem: str) -> PullerFile:
-    """The puller of a file's content; without a name it has the file's."""
-    if found.get("format") != FORMAT:
-        raise CzError(f"expected 'format = {FORMAT}' at the top, not {found.get('format', 'nothing')!r:.40}")
-    if odd := set(found) - {"format", "name", *TABLES}:
-        raise CzError(unknown("table", f"[{min(odd)}]", [f"[{table}]" for table in TABLES]))
-    numbers: dict[str, Any] = {}
-    missing: list[str] = []
-    for table in TABLES:
-        given, known = found.get(table, {}), {key.name: key for key in KEYS if key.table == table}
-        if not isinstance(given, Mapping):
-            raise CzError(f"{table} must be a table [{table}], not {given!r:.40}")
-        for name, value in given.items():
-            if name not in known:
-                raise CzError(_misplaced(table, name, known))
-            key, read = known[name], _read(value, known[name])
-            numbers[key.field] = (read, read) if key.drawn and not isinstance(read, tuple) else read
-        missing += [name for name in known if name not in given]
-    parameters = Parameters(**{name: numbers.pop(name) for name in Parameters._fields if name in numbers})
-    return PullerFile(found.get("name", stem), parameters, **numbers, missing=tuple(missing))
-
-
-def _misplaced(table: str, name: str, known: Mapping[str, Key]) -> str:
-    """The line on a key that a table does not have."""
-    for key in KEYS:
-        if key.name == name:
-            return f"{name} belongs in [{key.table}], not in [{table}]"
-        if key.table == table and name.startswith(f"{key.stem}_"):
-            return f"[{table}] has no key {name!r}: did you mean {key.name!r}?"
-    return unknown(f"key of [{table}]", name, known)
-
-
-def _read(value: Any, key: Key) -> Any:
-    """A decimal number of the key's unit, or each of a list, in SI units, rounded once; anything else as it is."""
-    if isinstance(value, list):
-        return tuple(_read(each, key) for each in value)
-    if isinstance(value, bool) or not isinstance(value, int | Decimal) or not Decimal(value).is_finite():
-        return value
-    if not -400 < Decimal(value).adjusted() < 300:  # beyond, a float is infinite, or the fraction needs minutes
-        raise CzError(f"{key.name} = {value} is no plausible number")
-    return float(Fraction(value) * key.size)
-
-
-def _shortest(value: float, key: Key) -> str:
-    """The shortest decimal number that :func:`_read` reads as this value."""
-    exact = Fraction(value) / key.size
-    for digits in range(1, 40):
-        context = Context(prec=digits)
-        text = context.divide(Decimal(exact.numerator), Decimal(exact.denominator))
-        if _read(text, key) == value:
-            break
-    plain = text.normalize(Context(prec=40))
-    return f"{plain:f}" if -5 < plain.adjusted() < 7 else f"{plain:E}"
-
-
-def _check(key: Key, value: Any) -> None:
-    """Raise CzError, with a guess at the unit that was meant, unless a key's value is plausible."""
-    if value is None and key in _OWN and getattr(PullerFile, key.field) is None:
+def _check(puller: PullerFile, quantity: Quantity) -> None:
+    """Raise CzError, with a guess at the unit that was meant, unless a number of the puller is plausible."""
+    value, drawn = value_of(puller, quantity), quantity.drawn
+    if value is None and getattr(PullerFile, quantity.symbol, 0.0) is None:
         return
-    size, slips = UNITS[key.unit]
-    numbers = value if key.drawn and isinstance(value, tuple) else (value,)
+    numbers = value if drawn and isinstance(value, tuple) else (value,)
     sound = all(isinstance(each, int | float) and not isinstance(each, bool) for each in numbers)
-    if not sound or len(numbers) != 1 + key.drawn or not numbers[0] <= numbers[-1]:
-        pair = ", or a pair [low, high] with low <= high" if key.drawn else ""
+    if not sound or len(numbers) != 1 + drawn or not numbers[0] <= numbers[-1]:
+        pair = ", or a pair [low, high] with low <= high" if drawn else ""
         given = value if isinstance(value, tuple) else (value,)
-        texts = ", ".join(f"{each / size:g}" if isinstance(each, float) else str(each) for each in given)
-        raise CzError(f"{key.name} must be a number{pair}, not {f'[{texts}]' if given is value else texts:.60}")
+        texts = ", ".join(f"{each / quantity.size:g}" if isinstance(each, float) else str(each) for each in given)
+        raise CzError(f"{quantity.key} must be a number{pair}, not {f'[{texts}]' if given is value else texts:.60}")
     for number in numbers:
-        shown = number / size
-        if not key.low - 1e-12 * abs(key.low) <= shown <= key.high + 1e-12 * abs(key.high):
-            guesses = [(shown * factor + offset, unit) for unit, factor, offset in slips if shown > 0.0]
-            meant = [f": did you mean {guess:.6g} ({shown:g} {unit})?" for guess, unit in guesses
-                     if key.low <= guess <= key.high]  # fmt: skip
-            raise CzError(f"{key.name} = {shown:g} must lie within {key.low:g} to {key.high:g}{''.join(meant[:1])}")
+        if not quantity.holds(number):
+            limits = quantity.limits(number, quantity.shown)
+            raise CzError(f"{quantity.key} = {number / quantity.size:g} must lie within {limits}")
 
 
 DEFAULT = PullerFile()
 """The puller that was invented for this project: that of every environment without another one."""
-
-
-@dataclass(frozen=True)
-class ScenarioOn(Scenario):
-    """A scenario on a puller: :func:`on` makes one."""
-
-    puller: str = ""
-    """Hash of the puller."""
-
-    @property
-    def hash(self) -> str:
-        """SHA-256 of the scenario's contents and its puller (16 hex digits)."""
-        return hashlib.sha256(f"{super().hash} {self.puller}".encode()).hexdigest()[:16]
-
-
-def on(puller: PullerFile, distribution: Distribution) -> Distribution:
-    """The scenario, or each one of a mixture, on a puller.
-
-    What the puller's file says of drives, sensors and melt stands in place of the scenario's. Of the rest, shares,
-    temperatures and times stay as they are; lengths are in proportion to r_0, speeds to v_0, powers to the heater's
-    range; changes of the reference to v_0 as well, so that the cone angle that they ask for stays. On the default
-    puller nothing changes. CzError for a scenario on another puller.
-    """
-    if isinstance(distribution, Mixture):
-        members: Any = tuple(on(puller, each) for each in distribution.scenarios)
-        return replace(distribution, scenarios=members)
-    there = getattr(distribution, "puller", DEFAULT.hash)
-    if there == puller.hash:
-        return distribution
-    if isinstance(distribution, ScenarioOn):
-        raise CzError(f"scenario {distribution.name!r} is on another puller ({there}) than {puller.label}")
-    speed = puller.parameters.v_0 / DEFAULT.parameters.v_0
-    sizes = {IN_MM: puller.scale, IN_MM_PER_MIN: speed, IN_MM_PER_MIN2: speed}
-    power, room = puller.power_range / DEFAULT.power_range, puller.pull_room
-    said = {key.field: value_of(puller, key) for key in _OWN} | {"pull_window": room if math.isfinite(room) else None}
-    said["sd"] = said["fluctuation_sd"]
-    families: dict[str, Any] = {}
-    for family in fields(Scenario)[1:]:
-        old, values = getattr(distribution, family.name), {}
-        for each in fields(old):
-            size = power if each.name.startswith("heater_") else sizes.get(each.metadata["member"].slip, 1.0)
-            size = speed if family.name == "reference" and each.name == "amount" else size
-            stated, own = said.get(each.name), getattr(old, each.name)
-            scaled = own if size == 1.0 else tuple(size * end for end in own) if isinstance(own, tuple) else size * own
-            values[each.name] = scaled if stated is None else stated
-        families[family.name] = type(old)(**values)
-    return ScenarioOn(distribution.name, puller=puller.hash, **families)

@@ -1,7 +1,5 @@
 """Conversions between SI and the units people read: ``0.5 * MM`` enters SI, ``r_c / MM`` leaves it."""
 
-from __future__ import annotations
-
 MM = 1e-3
 """One millimetre [m]."""
 KILO = 1e3
@@ -12,6 +10,8 @@ HOUR = 3600.0
 """One hour [s]."""
 MM_PER_MIN = MM / MINUTE
 """One millimetre per minute [m/s]."""
+CELSIUS = 273.15
+"""Zero degrees Celsius [K]."""
 PERCENT = 1e-2
 """One per cent [-]."""
 MICRO = 1e-6

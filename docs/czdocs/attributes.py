@@ -1,7 +1,5 @@
 """Docstrings of fields: the text below each, its unit in the first brackets."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import re

@@ -1,7 +1,5 @@
 """Formulas as MathML, written when the site is built: browsers show them without scripts, fonts or a network."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -1,7 +1,5 @@
 """API pages: docstrings as this project writes them, and links to names that stand on no page."""
 
-from __future__ import annotations
-
 import dataclasses
 import pkgutil
 import re

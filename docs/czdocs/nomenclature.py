@@ -1,7 +1,5 @@
 r"""The nomenclature: symbols follow from the code's names, equations from where the physics page uses them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -3,9 +3,6 @@
 ``make tables`` writes them into the pages anew; a test compares.
 """
 
-from __future__ import annotations
-
-import dataclasses
 import json
 import math
 import re
@@ -18,28 +15,19 @@ from typing import Any
 from cz_gym import SCENARIOS, Scenario
 from cz_gym.body.signals import INFO_ROWS, PULL_SCALE
 from cz_gym.camera.view import Camera
+from cz_gym.episodes.scenario import FAMILIES
 from cz_gym.episodes.scenarios import RANDOMIZED
-from cz_gym.machine.puller import DEFAULT, KEYS, PullerFile, value_of
+from cz_gym.machine.puller import DEFAULT, value_of
 from cz_gym.machine.serve.machine import TAGS
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, STATE, Channel
-from cz_gym.physics.parameters import Parameters, describe
-from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.physics.parameters import describe
+from cz_gym.physics.quantities import MACHINE, Quantity
+from cz_gym.support.units import MINUTE
 
 from . import nomenclature
-from .attributes import attributes
 
 ABSENT = "\N{EN DASH}"
 POWERS = str.maketrans("234", "²³⁴")
-READABLE = {
-    "m": (MM, "mm"),
-    "m/s": (MM_PER_MIN, "mm/min"),
-    "m/s2": (MM_PER_MIN / MINUTE, "mm/min²"),
-    "K/s": (1.0 / MINUTE, "K/min"),
-    "W/s": (KILO / MINUTE, "kW/min"),
-    "rev/s": (1.0 / MINUTE, "rev/min"),
-    "s": (1.0, "s"),
-}
-"""Units that people read instead of SI: size in SI and name."""
 
 
 def markdown(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
@@ -96,12 +84,12 @@ def info() -> list[str]:
     return markdown(("key", "unit", "meaning"), ((code(row.name), units(row.unit), row.meaning) for row in INFO_ROWS))
 
 
-def readable(value: Any, unit: str) -> str:
+def readable(value: Any, quantity: Quantity) -> str:
     """A scenario's number, or range, in the unit that people read."""
-    size, name = READABLE.get(unit, (1.0, "" if unit == "-" else unit))
-    if unit == "s" and max(value if isinstance(value, tuple) else (value,)) >= 5 * MINUTE:
-        size, name = MINUTE, "min"
     ends = value if isinstance(value, tuple) else (value, value)
+    size, name = quantity.size, "" if quantity.shown == "1" else units(quantity.shown)
+    if name == "s" and max(ends) >= 5 * MINUTE:
+        size, name = MINUTE, "min"
     low, high = (f"{end / size:.4g}" if math.isfinite(end) else "∞" for end in ends)
     between = f"±{high}" if low == f"-{high}" else low if low == high else f"{low} to {high}"
     return f"{between} {name}".strip()
@@ -110,14 +98,12 @@ def readable(value: Any, unit: str) -> str:
 def scenario_table(columns: list[Scenario]) -> list[str]:
     """Scenarios as columns, one line for each number in which any of them departs from the default."""
     rows = []
-    for family in dataclasses.fields(Scenario)[1:]:
-        values = [getattr(scenario, family.name) for scenario in columns]
-        absent = type(values[0])()
-        for name, unit, meaning in attributes(type(absent)):
-            cells = [getattr(value, name) for value in values]
-            if any(cell != getattr(absent, name) for cell in cells):
-                written = [readable(cell, unit) if cell != getattr(absent, name) else ABSENT for cell in cells]
-                rows.append((f"{code(f'{family.name}.{name}')} {meaning}", *written))
+    for members in zip(*(scenario.members for scenario in columns), strict=True):
+        family, each, _ = members[0]
+        quantity, cells = each.metadata["member"].quantity, [value for _, _, value in members]
+        if any(cell != each.default for cell in cells):
+            written = [ABSENT if cell == each.default else readable(cell, quantity) for cell in cells]
+            rows.append((f"{code(f'{family}.{each.name}')} {quantity.meaning}", *written))
     return markdown(("", *(code(scenario.name) for scenario in columns)), rows)
 
 
@@ -129,7 +115,7 @@ def single_scenarios() -> list[str]:
 
 def _single(scenario: Scenario) -> str | None:
     """The one family of a scenario, if it is as in randomized."""
-    names = [f.name for f in dataclasses.fields(scenario)[1:] if getattr(scenario, f.name) != f.default_factory()]
+    names = [name for name, kind in FAMILIES.items() if getattr(scenario, name) != kind()]
     alone = len(names) == 1 and getattr(scenario, names[0]) == getattr(RANDOMIZED, names[0])
     return names[0] if alone else None
 
@@ -137,12 +123,10 @@ def _single(scenario: Scenario) -> str | None:
 def families() -> list[str]:
     """Every member of every family, with unit and default."""
     rows = []
-    for family in dataclasses.fields(Scenario)[1:]:
-        absent = family.default_factory()  # type: ignore[misc]
-        for name, unit, meaning in attributes(type(absent)):
-            default = getattr(absent, name)
-            shown = f"{default:g}" if not isinstance(default, tuple) else f"({default[0]:g}, {default[1]:g})"
-            rows.append((code(f"{type(absent).__name__}.{name}"), units(unit), shown, meaning))
+    for family, each, value in Scenario("plain").members:
+        quantity, name = each.metadata["member"].quantity, f"{FAMILIES[family].__name__}.{each.name}"
+        shown = f"({value[0]:g}, {value[1]:g})" if isinstance(value, tuple) else f"{value:g}"
+        rows.append((code(name), units(quantity.unit), shown, quantity.meaning))
     return markdown(("member", "unit", "default", "meaning"), rows)
 
 
@@ -157,15 +141,12 @@ def symbols(part: str) -> list[str]:
 
 def puller() -> list[str]:
     """The keys of a puller file."""
-    known = {name: quantity.meaning for name, quantity in describe(Parameters).items()}
-    known |= {each.name: each.meaning for each in attributes(PullerFile)}
     rows = []
-    for key in KEYS:
-        value = value_of(DEFAULT, key)
-        default = "the scenario's" if value is None else f"{value / float(key.size):.10g}"
-        pair = "number or pair" if key.drawn else ""
-        name = code(f"[{key.table}]"), code(key.name)
-        rows.append((*name, default, f"{key.low:g} to {key.high:g}", pair, known[key.field]))
+    for each in MACHINE.values():
+        value = value_of(DEFAULT, each)
+        default = "the scenario's" if value is None else f"{value / each.size:.10g}"
+        pair, limits = "number or pair" if each.drawn else "", f"{each.low:g} to {each.high:g}"
+        rows.append((code(f"[{each.table}]"), code(each.key), default, limits, pair, each.meaning))
     return markdown(("table", "key", "default", "range", "", "meaning"), rows)
 
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from cz_gym import SCENARIOS, make_puller
+from cz_gym.body import schedule
 from cz_gym.body.plant import hidden_load
 from cz_gym.body.schedule import bias_offset, disturbance, drift, pyrometer_drift, recipe, reference, ripple
-from cz_gym.episodes import schedule
 from cz_gym.episodes.record import Episode
 from cz_gym.episodes.series import draw_episode, new_series
 

@@ -11,7 +11,7 @@ from scipy import stats
 from cz_gym import SCENARIOS, Parameters, Scenario, make_puller
 from cz_gym.episodes.draw import randomised
 from cz_gym.episodes.record import FREEZES, Episode, Factors
-from cz_gym.episodes.scenario import Draw, Faults, Interface, Recipe, Reference, Sensor
+from cz_gym.episodes.scenario import Actuators, Draw, Faults, Interface, Recipe, Reference, Sensor
 from cz_gym.episodes.series import draw_episode, draw_factors, new_series
 
 MM, MINUTE, SPAN = 1e-3, 60.0, 10800.0
@@ -31,38 +31,50 @@ def keys(n):
     return [(i, 3 * i + 1) for i in range(n)]
 
 
-def within(value, low, high, unit=1.0):
-    return low * unit - 1e-12 <= value <= high * unit + 1e-12
-
-
-RANGES = {
-    "randomized": {
-        "recipe_duration": (5, 10, MINUTE), "recipe_start": (10, 110, MINUTE), "drift_amount": (-5, 5, 1),
-        "drift_duration": (20, 100, MINUTE), "drift_start": (0, 100, MINUTE), "reference_amount": (-2.5, 2.5, MM),
-        "reference_duration": (20, 50, MINUTE), "reference_start": (10, 110, MINUTE), "ring_offset": (0, 0, 1),
-        **dict.fromkeys(("bias_drift_amount", "ripple_amplitude", "pyrometer_drift", "melt_loss"), (0, 0, 1)),
-    },
-    "puller": {
-        "ring_offset": (-0.4, 0.4, MM), "ripple_amplitude": (0, 0.2, MM), "ripple_omega": (8, 15, 2 * math.pi / MINUTE),
-        "ripple_phase": (0, 2 * math.pi, 1), "pyrometer_drift": (-2, 2, 1),
-    },
-    "sensor-fault": {
-        "bias_drift_amount": (-0.3, 0.3, MM), "bias_drift_duration": (1, 2, 3600), "bias_drift_start": (0, SPAN, 1),
-    },
+WHOLE = dataclasses.replace(
+    SCENARIOS["puller"],
+    name="whole",
+    faults=SCENARIOS["sensor-fault"].faults,
+    actuators=Actuators(heater_lag=(0.0, 10.0), heater_dead_time=(2.0, 5.0)),
+    sensor=dataclasses.replace(SCENARIOS["puller"].sensor, pyrometer_filter=(0.0, 20.0)),
+)
+"""All of puller and sensor-fault at once, and a slow heater and pyrometer."""
+DRAWN = {
+    "recipe": {"recipe_duration": "duration", "recipe_start": "start"},
+    "drift": {"drift_amount": "amount", "drift_duration": "duration", "drift_start": "start"},
+    "reference": {"reference_duration": "duration", "reference_start": "start"},
+    "sensor": {"ripple_amplitude": "ripple", "pyrometer_drift": "pyrometer_drift", "camera_sd": "camera_noise",
+               "pyrometer_sd": "pyrometer_noise", "pyrometer_filter": "pyrometer_filter"},
+    "faults": {"bias_drift_amount": "bias_drift", "bias_drift_duration": "bias_drift_duration", "dropout": "dropout"},
+    "actuators": {"heater_lag": "heater_lag", "heater_dead_time": "heater_dead_time"},
 }  # fmt: skip
-"""Least value, largest value and their unit, of an episode's numbers by scenario."""
+"""Constants of an episode that are drawn between the ends of a member, by family."""
 
 
-@given(KEY, st.sampled_from(sorted(RANGES)))
-def test_draws_lie_in_the_designs_ranges(key, scenario):
-    e, _ = draw(scenario, key)
-    for name, ends in RANGES[scenario].items():
-        assert within(getattr(e, name), *ends), name
-    f = draw_factors(SCENARIOS[scenario], (0.0, 1.0), key)
-    assert within(e.recipe_amount / e.recipe_duration, -0.5, 0.5, 1 / MINUTE)
-    assert within(f.lam, 0, 1)
-    assert within(f.a, 0.97, 1.03)
-    assert all(within(factor, 0.9, 1.1) for factor in (f.k_l, f.kappa_12, f.G_1a, f.G_2b, f.kappa_b))
+def test_constants_are_uniform_in_their_members_ranges_and_independent():
+    episodes, columns = [draw(WHOLE, key)[0] for key in keys(2000)], []
+    for family, members in DRAWN.items():
+        for name, member in members.items():
+            low, high = getattr(getattr(WHOLE, family), member)
+            columns.append([(getattr(e, name) - low) / (high - low) for e in episodes])
+    rates = np.array([e.recipe_amount / e.recipe_duration for e in episodes]) * MINUTE
+    turns = np.array([(e.ripple_omega, e.ripple_phase) for e in episodes]) / (2 * math.pi)
+    check_uniform(np.array([*columns, rates + 0.5, (turns[:, 0] * MINUTE - 8) / 7, turns[:, 1]]).T)
+    moved = np.array([e.reference_amount for e in episodes if e.reference_amount != 0.0])
+    check_uniform(0.5 + 0.5 * moved[:, None] / (2.5 * MM))
+    assert len(moved) / 2000 == pytest.approx(0.5, abs=0.045)
+    offsets = np.abs([e.ring_offset for e in episodes])
+    assert 0.35 * MM < offsets.max() <= 0.4 * MM
+    assert stats.kstest([e.r_c_start / (0.2 * MM) for e in episodes], "norm").pvalue > 1e-3
+
+
+def test_a_slow_heater_and_pyrometer_change_no_other_draw():
+    quick = dataclasses.replace(WHOLE, actuators=Actuators(), sensor=SCENARIOS["puller"].sensor)
+    assert not dataclasses.replace(Scenario("slow"), actuators=WHOLE.actuators).deterministic
+    for key in keys(5):
+        one, other = draw(WHOLE, key), draw(quick, key)
+        assert one[0].heater_dead_time > 2.0
+        assert same((one[0]._replace(heater_lag=0.0, heater_dead_time=0.0, pyrometer_filter=0.0), one[1]), other)
 
 
 @given(KEY)
@@ -71,8 +83,8 @@ def test_freezes_last_as_designed_and_are_disjoint(key):
     lengths = series.freezes[:, 1] - series.freezes[:, 0]
     flagged = lengths[: FREEZES - 1]
     assert 1 <= np.count_nonzero(flagged) <= 3
-    assert all(within(length, 30, 180) for length in flagged[flagged > 0])
-    assert within(lengths[-1], 30, 60)
+    assert np.all((flagged[flagged > 0] >= 30) & (flagged[flagged > 0] <= 180 + 1e-9))
+    assert 30 <= lengths[-1] <= 60 + 1e-9
     windows = sorted(window.tolist() for window in series.freezes if window[1] > 0)
     assert windows[0][0] >= 0
     assert windows[-1][1] <= SPAN
@@ -102,16 +114,14 @@ BESIDE = dataclasses.replace(
     faults=Faults(flagged_duration=(50.0, 50.0), unflagged_duration=(50.0, 50.0)),
 )
 """Every episode is the same, but a member that is random takes effect."""
-FAMILIES = [family.name for family in dataclasses.fields(Scenario)[1:]]
-MEMBERS = [(family, each) for family in FAMILIES for each in dataclasses.fields(getattr(BESIDE, family))]
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.5])
-@pytest.mark.parametrize(("family", "member"), MEMBERS, ids=lambda part: getattr(part, "name", part))
+@pytest.mark.parametrize(("family", "member"), [each[:2] for each in BESIDE.members])
 def test_every_member_says_whether_it_is_random(family, member, spread):
     """A scenario called deterministic draws the same episode for every key; a member without that information fails."""
     says, whole = member.metadata["member"], isinstance(np.ravel(member.default)[0].item(), int)
-    high = says.high if whole else min(0.5 * says.high, 100.0)
+    high = says.quantity.high if whole else min(0.5 * says.quantity.high * says.quantity.size, 100.0)
     low = high if not spread else 0 if whole else spread * high
     value = (low, high) if isinstance(member.default, tuple) else low if says.draw is Draw.CHANCE else high
     part = dataclasses.replace(getattr(BESIDE, family), **{member.name: value})
@@ -164,19 +174,14 @@ def test_interface_fluctuation_is_two_stationary_processes():
     assert stats.kstest(runs[:, 100] / math.sqrt(2), "norm").pvalue > 1e-3
 
 
-def test_draws_are_uniform():
-    factors = np.array([draw_factors(SCENARIOS["randomized"], (0.0, 1.0), key) for key in keys(2000)])
-    assert (factors[:, 7:] == 1.0).all()
-    widths = np.array([0.5, 0.03, 0.1, 0.1, 0.1, 0.1, 0.1])
-    middle = np.array([0.5, 1, 1, 1, 1, 1, 1])
-    check_uniform(0.5 + 0.5 * (factors[:, :7] - middle) / widths)
-
-
-def test_hot_zone_draws_are_log_uniform_on_the_crystals_of_randomized():
+def test_factors_are_uniform_and_those_of_hot_zones_log_uniform_on_the_same_crystals():
     hot_zone, randomized = (
         np.array([draw_factors(SCENARIOS[name], (0.0, 1.0), key) for key in keys(2000)])
         for name in ("hot-zone", "randomized")
     )
+    assert (randomized[:, 7:] == 1.0).all()
+    widths, middle = np.array([0.5, 0.03, *[0.1] * 5]), np.array([0.5, *[1.0] * 6])
+    check_uniform(0.5 + 0.5 * (randomized[:, :7] - middle) / widths)
     np.testing.assert_array_equal(hot_zone[:, :3], randomized[:, :3])
     assert draw("hot-zone", (5, 6))[0] == draw("randomized", (5, 6))[0]
     low = np.log([0.75] * 4 + [0.5, 0.5, 0.7])
@@ -191,14 +196,7 @@ def check_uniform(columns):
     assert np.abs(np.corrcoef(columns.T) - np.eye(columns.shape[1])).max() < 0.1
 
 
-def test_half_the_references_move_and_the_start_is_normal():
-    episodes = [draw("randomized", key)[0] for key in keys(2000)]
-    assert np.mean([e.reference_amount != 0 for e in episodes]) == pytest.approx(0.5, abs=0.045)
-    starts = np.array([e.r_c_start for e in episodes]) / (0.2 * MM)
-    assert stats.kstest(starts, "norm").pvalue > 1e-3
-
-
-def test_outliers_are_rare_and_normal_and_dropouts_have_their_probability():
+def test_what_happens_by_chance_has_its_probability_and_its_distribution():
     sensor, faults = Sensor(outlier_probability=0.02, outlier_sd=1e-3), Faults(dropout=(0.03, 0.03))
     camera = draw(Scenario("mine", sensor=sensor), (3, 4), samples=100_000)[1].noise[:, 0]
     hit = camera[camera != 0]
@@ -206,9 +204,6 @@ def test_outliers_are_rare_and_normal_and_dropouts_have_their_probability():
     assert stats.kstest(hit / 1e-3, "norm").pvalue > 1e-3
     camera = draw(Scenario("mine", faults=faults), (3, 4), samples=50_000)[1].noise[:, 0]
     assert np.isnan(camera).mean() == pytest.approx(0.03, abs=4 * math.sqrt(0.03 / 50_000))
-
-
-def test_one_freeze_starts_uniformly():
     scenario = Scenario("mine", faults=Faults(flagged=(1, 1), flagged_duration=(100.0, 100.0)))
     starts = [draw(scenario, key)[1].freezes[0, 0] for key in keys(1000)]
     assert stats.kstest(starts, stats.uniform(0, SPAN - 100).cdf).pvalue > 1e-3

@@ -137,7 +137,7 @@ def test_another_version_of_a_package_that_computes_runs_cached_episodes_again(p
 @pytest.mark.parametrize(
     ("room", "computes"),
     [
-        *((name, True) for name in ("physics", "episodes", "engine", "task.py", "cost.py", "evaluation/metrics.py")),
+        *((name, True) for name in ("physics", "body", "episodes", "engine", "evaluation/metrics.py")),
         *((name, False) for name in ("rendering/palette.py", "camera", "evaluation/report")),
     ],
 )

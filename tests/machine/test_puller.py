@@ -6,74 +6,74 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-import cz_gym
-from cz_gym import SCENARIOS, CzVectorEnv, Scenario, decode, make_puller
+from cz_gym import SCENARIOS, CzVectorEnv, decode, make_puller
 from cz_gym.config import Config, make_config
 from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.env import CzEnv
 from cz_gym.episodes.scenarios import ALL, HARD, PULLER, RANDOMIZED
 from cz_gym.errors import CzError
+from cz_gym.machine import describe
+from cz_gym.machine.adapt import adapt_scenario
 from cz_gym.machine.puller import (
     DEFAULT,
-    KEYS,
+    FOLDER,
     PullerFile,
+    chosen_puller,
+    doubts,
     find_puller,
-    on,
     read_puller,
     to_toml,
     value_of,
     write_puller,
 )
 from cz_gym.physics.parameters import Parameters
+from cz_gym.physics.quantities import MACHINE
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
 from tests.observed import PLAIN
 
-SHIPPED = sorted(path.stem for path in cz_gym.machine.puller.FOLDER.glob("*.toml"))
+SHIPPED = sorted(path.stem for path in FOLDER.glob("*.toml"))
 WIDE = find_puller("silicon-300mm")
+AS_THEY_ARE = ("heater_max", "pull_max", "g", "sigma_SB", "alpha_0", "rho_l", "sigma", "phi_b", "T_m", "heater_step")
 
 
 def file(folder, text):
     path = folder / "mine.toml"
-    path.write_text(f"format = 1\n{text}", "utf-8")
+    path.write_text(text if "format" in text else f"format = 1\n{text}", "utf-8")
     return path
 
 
 @st.composite
 def pullers(draw):
-    parameters = {}
-    own = {}
-    for key in KEYS:
-        if key.field in ("heater_max", "pull_max", "g", "sigma_SB", "alpha_0", "rho_l", "sigma", "phi_b", "T_m"):
+    parameters, own = {}, {}
+    for symbol, quantity in MACHINE.items():
+        if symbol in AS_THEY_ARE:
             continue
-        middle = value_of(DEFAULT, key)
-        low, high = (max(key.low, -100.0) * float(key.size), min(key.high, 100.0) * float(key.size))
-        if key.field in Parameters._fields:
+        middle, part = value_of(DEFAULT, quantity), parameters if symbol in Parameters._fields else own
+        low, high = (max(quantity.low, -100.0) * quantity.size, min(quantity.high, 100.0) * quantity.size)
+        if part is parameters:
             low, high = 0.9 * middle, 1.1 * middle
         value = draw(st.none() | st.floats(low, high, allow_subnormal=False))
         if value is not None:
             other = draw(st.floats(low, high, allow_subnormal=False))
-            part = parameters if key.field in Parameters._fields else own
-            part[key.field] = tuple(sorted((value, other))) if key.drawn else value
+            part[symbol] = tuple(sorted((value, other))) if quantity.drawn else value
     return PullerFile(draw(st.sampled_from(["my puller", "Züchtung 3", '"q"\\'])), Parameters(**parameters), **own)
 
 
 @settings(max_examples=60, deadline=None)
 @given(puller=pullers())
-@example(puller=PullerFile("ends", camera_noise=(5e-324, 1e-305), pyrometer_drift=(-100.0, 100.0)))
+@example(puller=PullerFile("ends", camera_noise=(5e-324, 1e-305), pyrometer_drift=(-100.0, 100.0), heater_step=0.3))
 def test_what_is_written_is_read_again_bit_for_bit(puller, tmp_path_factory):
     path = tmp_path_factory.mktemp("puller") / "mine.toml"
     write_puller(puller, path)
     again = read_puller(path)
-    assert again == puller
-    assert again.hash == puller.hash
-    assert to_toml(again) == to_toml(puller)
+    assert (again, again.hash, to_toml(again)) == (puller, puller.hash, to_toml(puller))
 
 
 def test_what_a_file_does_not_say_keeps_the_defaults_value_and_is_listed(tmp_path):
-    puller = read_puller(file(tmp_path, "[crystal]\nradius_mm = 100\n[sensors]\ncamera_noise_mm = [0, 0.05]\n"))
+    text = "\ufeffformat = 1\n[crystal]\nradius_mm = 100\n[sensors]\ncamera_noise_mm = [0, 0.05]\n"
+    puller = read_puller(file(tmp_path, text))  # with the mark that Windows' editors put first
     assert puller.parameters == Parameters(r_0=100 * MM)
-    assert puller.camera_noise == (0.0, 0.05 * MM)
-    assert puller.name == "mine"
+    assert (puller.camera_noise, puller.name) == ((0.0, 0.05 * MM), "mine")
     assert "C_1_J_per_K" in puller.missing
     assert not {"radius_mm", "camera_noise_mm"} & set(puller.missing)
 
@@ -89,15 +89,20 @@ def test_what_a_file_does_not_say_keeps_the_defaults_value_and_is_listed(tmp_pat
         ("[crystal]\nradius_mm = [1, 2]", "must be a number, not [1, 2]"),
         ("[crystal]\nradius_mm = 1e9999", "no plausible number"),
         ("[crystal]\nradius_mm = 300", "must be wider than the crystal"),
+        ("[crystal]\nT_m_K = 3103", "must lie within 200 to 3000"),  # silicon carbide, which has no melt
+        ("[crystal]\nT_m_K = 2900", "the heater would have to be at 38"),
         ("[hot_zone]\nT_a_K = 25", "did you mean 298.15 (25 °C)"),
         ("[hot_zone]\nC_1_J_per_K = 57", "did you mean 57000 (57 kJ/K)"),
         ("[drives]\nheater_range_kW = 5000", "did you mean 5 (5000 W)"),
         ("[drives]\nheater_max_kW = 20", "excludes the operating point, which needs"),
         ("[drives]\npull_max_mm_per_min = 1", "excludes the operating point, whose pull speed is 1.2"),
+        ("[drives]\nheater_step_W = 10000", "no less than the heater's range, 10 kW"),
+        ("[drives]\nheater_lag_s = [0, 2000]", "did you mean 2 (2000 ms)"),
         ("[sensors]\ncamera_noise_mm = [0.1, 0.05]", "low <= high, not [0.1, 0.05]"),
         ("[sensors]\ninterval_s = 2000", "did you mean 2 (2000 ms)"),
         ("name = 5", "must be up to 80 printable characters"),
         ("[crystal", "mine.toml"),
+        ("format = 2", "expected 'format = 1'"),
     ],
 )
 def test_a_bad_file_is_refused_in_one_line(tmp_path, text, said):
@@ -109,13 +114,48 @@ def test_a_bad_file_is_refused_in_one_line(tmp_path, text, said):
     assert "\n" not in str(refused.value)
 
 
-def test_other_formats_and_unknown_pullers_are_refused(tmp_path):
-    path = tmp_path / "old.toml"
-    path.write_text("[crystal]\n")
-    with pytest.raises(CzError, match="expected 'format = 1'"):
-        read_puller(path)
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[crystal]\nradius_mm = 202", "R_cr_mm = 280 is 1.4 times radius_mm = 202, most are 2 to 4.5 times: is one"),
+        ("[crystal]\nradius_mm = 202\n[hot_zone]\nR_cr_mm = 450\nC_b_J_per_K = 3e5", None),  # a 400 mm crystal
+        ("[crystal]\nradius_mm = 202\n[hot_zone]\nR_cr_mm = 560", "would be 32 mm deep in a crucible with R_cr_mm"),
+        ("[crystal]\nradius_mm = 10.1", "R_cr_mm = 280 is 28 times radius_mm = 10.1"),
+        ("[crystal]\npull_speed_mm_per_min = 0.017", "most are 0.05 to 5: did you mean 1.02 (0.017 mm/s)"),
+        ("[crystal]\npull_speed_mm_per_min = 10.1", "is unusual, most are 0.05 to 5"),
+        ("[hot_zone]\nR_cr_mm = 560", "R_cr_mm = 560 is 6.4 times radius_mm = 87.5"),
+        ("[hot_zone]\nT_e_K = 1027", "did you mean 1300.15 (1027 °C)"),
+        ("[hot_zone]\nT_e_K = 900", None),  # no heat shield
+        ("[drives]\nheater_step_W = 1000", "a coarse step"),
+        ("[drives]\nheater_range_kW = 60", "more than the nominal power, 57"),
+    ],
+)
+def test_what_is_improbable_is_questioned_in_one_line(tmp_path, text, said, capsys):
+    chosen_puller(str(file(tmp_path, text)))
+    missing, *doubts = capsys.readouterr().err.splitlines()
+    assert "the default's values for" in missing
+    assert said in doubts[0] if said else not doubts
+
+
+def test_names_are_found_beside_folders_of_the_same_name(tmp_path, monkeypatch):
     with pytest.raises(CzError, match="unknown puller 'defaul': did you mean 'default'"):
         find_puller("defaul")
+    monkeypatch.chdir(tmp_path)
+    for name in ("default", "germanium", "other"):
+        (tmp_path / name).mkdir()
+    assert (find_puller("default"), find_puller("germanium").parameters.T_m) == (DEFAULT, 1211.0)
+    with pytest.raises(CzError, match="unknown puller 'other'"):
+        find_puller("other")
+
+
+def test_the_command_prints_what_a_file_implies(tmp_path, capsys):
+    assert describe.main([str(file(tmp_path, "[crystal]\nradius_mm = 202\n[drives]\nheater_lag_s = [2, 5]"))]) == 0
+    printed = capsys.readouterr()
+    puller = make_puller(Parameters(r_0=0.202))
+    for text in (f"{puller.Q_H_0 / KILO:.4g} kW", f"{puller.T_1_0:.0f} K", f"{puller.h_0 / MM:.3g} mm high", "404 mm",
+                 "0 to 2.4 mm/min", "heater lag 2 to 5 s", "sigma_N_per_m = 0.72", "latency_s"):  # fmt: skip
+        assert text in printed.out
+    assert "is one of them a diameter" in printed.err
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -125,6 +165,7 @@ def test_one_many_and_differentiable_crystals_are_the_same_on_a_puller(name):
     many = CzVectorEnv(2, **given, **PLAIN)
     twin = DifferentiableBatch(many.config, 2)
     assert env.config == many.config
+    assert not doubts(find_puller(name))
     assert env.config.control_interval == find_puller(name).control_interval
     first, _ = env.reset(seed=3)
     rows, _ = many.reset(seed=3)
@@ -135,42 +176,46 @@ def test_one_many_and_differentiable_crystals_are_the_same_on_a_puller(name):
         rows, rewards, lost, _, infos = many.step(np.tile(action, (2, 1)))
         np.testing.assert_array_equal(rows[0], seen)
         np.testing.assert_array_equal(twin.step(np.tile(action, (2, 1))).measured, rows)
-        assert (rewards[0], lost[0]) == (gained, terminated)
+        assert (rewards[0], lost[0], infos["r_c"][0]) == (gained, terminated, info["r_c"])
         read = decode(seen, *env.config.ranges)
         np.testing.assert_allclose(read.v_p + env.config.parameters.v_0, info["v_p"], rtol=1e-6)
-        assert infos["r_c"][0] == info["r_c"]
     assert not terminated
 
 
 def test_the_default_file_changes_nothing():
     assert find_puller("default") == DEFAULT == find_puller(None)
     assert find_puller("default").label == "default"
-    mixed = {"hard": 0.5, "puller": 0.5}
-    for scenario in (*SCENARIOS, ALL, mixed):
+    for scenario in (*SCENARIOS, ALL, {"hard": 0.5, "puller": 0.5}):
         plain, filed = make_config(scenario), make_config(scenario, puller="default")
-        assert filed == plain
-        assert (filed.hash, filed.made_for, filed.identity) == (plain.hash, plain.made_for, plain.identity)
+        assert (filed, filed.hash, filed.made_for, filed.identity) == (
+            plain, plain.hash, plain.made_for, plain.identity)  # fmt: skip
 
 
 def test_the_machine_is_the_files_and_the_crystal_the_scenarios():
-    scenario = on(WIDE, PULLER)
-    assert isinstance(scenario, Scenario)
+    lagging = replace(WIDE, heater_lag=(0.0, 10.0), heater_dead_time=(5.0, 5.0), pyrometer_filter=(0.0, 20.0))
+    assert len({WIDE.hash, lagging.hash, replace(WIDE, heater_lag=(5.0, 5.0)).hash,
+                replace(WIDE, heater_dead_time=(5.0, 5.0)).hash}) == 4  # fmt: skip
+    slow = adapt_scenario(lagging, PULLER)
+    assert (slow.actuators.heater_lag, slow.actuators.heater_dead_time) == ((0.0, 10.0), (5.0, 5.0))
+    assert slow.sensor.pyrometer_filter == (0.0, 20.0)
+    drawn = replace(PULLER, actuators=replace(PULLER.actuators, heater_lag=(0.0, 10.0)))
+    assert adapt_scenario(WIDE, drawn).actuators.heater_lag == (0.0, 10.0)  # a time stays as it is
+    scenario = adapt_scenario(WIDE, PULLER)
     longer, faster = 150.0 / 87.5, 0.8 / 1.2
     assert scenario.sensor.camera_noise == WIDE.camera_noise
     assert (scenario.sensor.latency, scenario.interface.tau_fast) == (1.0, 40.0)
     assert scenario.actuators.pull_window == pytest.approx(0.4 * MM_PER_MIN)
     assert scenario.sensor.bias_offset == pytest.approx((-0.3 * longer * MM, 0.3 * longer * MM))
-    assert scenario.recipe == PULLER.recipe
+    assert (scenario.recipe, scenario.pullers.melt_loss) == (PULLER.recipe, PULLER.pullers.melt_loss)
     assert scenario.reference.amount[1] == pytest.approx(faster * PULLER.reference.amount[1])
-    assert scenario.pullers.melt_loss == PULLER.pullers.melt_loss
     bare = replace(WIDE, pull_window=None, pull_slew=None, heater_slew=None)
-    assert on(bare, PULLER).actuators.pull_window == pytest.approx(0.5 * faster * MM_PER_MIN)
-    assert on(bare, PULLER).actuators.heater_slew == pytest.approx(1.5 * 2000.0 / 60.0)
-    assert on(bare, HARD).hash != on(WIDE, HARD).hash != HARD.hash
-    assert on(WIDE, scenario) == scenario
-    assert on(WIDE, ALL).shares == ALL.shares
+    assert adapt_scenario(bare, PULLER).actuators.pull_window == pytest.approx(0.5 * faster * MM_PER_MIN)
+    assert adapt_scenario(bare, PULLER).actuators.heater_slew == pytest.approx(1.5 * 2000.0 / 60.0)
+    assert adapt_scenario(bare, HARD).hash != adapt_scenario(WIDE, HARD).hash != HARD.hash
+    assert adapt_scenario(WIDE, scenario) == scenario
+    assert adapt_scenario(WIDE, ALL).shares == ALL.shares
     with pytest.raises(CzError, match="is on another puller"):
-        on(bare, scenario)
+        adapt_scenario(bare, scenario)
 
 
 def test_limits_actions_and_episodes_are_in_proportion_to_the_puller():

@@ -6,15 +6,15 @@ import sys
 
 import pytest
 
-from cz_gym import atomic_files
 from cz_gym.errors import CzError
+from cz_gym.support import atomic_files
 from cz_gym.support.atomic_files import LOCK, check_writable, locked, naming, write_files
 from tests.processes import python
 
 KILL_AT_EVERY_LINE = """
 import os, signal, sys
 from pathlib import Path
-from cz_gym import atomic_files
+from cz_gym.support import atomic_files
 folder, names = Path(sys.argv[1]), ("a.json", "b.csv", "z.json")
 
 def killed_at(line):
