@@ -49,7 +49,7 @@ def compiled_sources(folder: Path | None = None) -> list[Path]:
 
 def source_hash(folder: Path | None = None) -> str:
     """Hash of the names and the code of :func:`compiled_sources` (32 hex digits)."""
-    return hash_files(compiled_sources(folder), code_only=True)
+    return hash_files(compiled_sources(folder))
 
 
 @cache

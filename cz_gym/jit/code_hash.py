@@ -29,16 +29,15 @@ def function_hash(*functions: Callable[..., Any]) -> str:
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
-def hash_files(files: Iterable[Path], code_only: bool = False) -> str:
+def hash_files(files: Iterable[Path]) -> str:
     """SHA-256 of the files' names, with their folder's, and contents (32 hex digits).
 
-    With ``code_only`` a Python file counts as its byte code: text of comments and docstrings, and checks by ``assert``
-    change nothing.
+    Of a Python file its byte code counts: comments, docstrings and checks by ``assert`` change nothing.
     """
     digest = hashlib.sha256()
     for file in files:
         content = file.read_bytes()
-        if code_only and file.suffix == ".py":
+        if file.suffix == ".py":
             content = repr(_byte_code(compile(content, "", "exec", dont_inherit=True, optimize=2))).encode()
         digest.update(f"{file.parent.name}/{file.name}".encode() + b"\0" + content + b"\0")
     return digest.hexdigest()[:32]
