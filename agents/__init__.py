@@ -4,8 +4,6 @@
 stable-baselines3; training (:mod:`cz_gym.agents.apg`, ``train.py``) needs both.
 """
 
-from __future__ import annotations
-
 if __name__ != "cz_gym.agents":
     raise ImportError("import cz_gym.agents: the folder agents is that package, under no other name")
 

@@ -6,8 +6,6 @@ For a :class:`cz_gym.sb3.CzVecEnv` with ``critic_state``. Critics read the state
 observations of the environment as it is. Needs stable-baselines3.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -241,7 +241,6 @@ def _convert(given: argparse.Namespace) -> None:
     model = _read(given.model, f"a model of {given.algo}", lambda path: algorithm.load(path, device="cpu"))
     crystals = scenarios(given.scenario)
     config = make_config(crystals, None, given.observation, given.control_interval, action=given.action)
-    _check_spaces(model, config)
     normalisation = None
     if given.vecnormalize:
         env = DummyVecEnv([lambda: CzEnv(observation=given.observation)])

@@ -18,6 +18,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_wrapper
 
 from cz_gym.body.signals import STATE
+from cz_gym.env import EnvState
 from cz_gym.errors import CzError
 from cz_gym.observation import HISTORY
 from cz_gym.support.names import needs
@@ -61,6 +62,7 @@ class CzVecEnv(VecEnv):
             if env.config.observation != "history":
                 raise CzError(f"critic_state needs observation='history', not {env.config.observation!r}")
             space = Box(-np.inf, np.inf, (len(HISTORY) + len(STATE),), np.float32)
+        self.slots = [Slot(self, i) for i in range(env.num_envs)]
         super().__init__(env.num_envs, space, env.single_action_space)
         self._actions = np.zeros((env.num_envs, 2), np.float32)
         self._returns = np.zeros(env.num_envs)
@@ -122,27 +124,63 @@ class CzVecEnv(VecEnv):
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The batch's attribute, once a slot."""
-        return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
+        """An attribute of each slot."""
+        return [getattr(slot, attr_name) for slot in self._at(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the whole batch."""
-        if indices is not None:
-            raise CzError("the slots share their attributes: set_attr takes no indices")
-        setattr(self.env, attr_name, value)
+        """Set an attribute of each slot."""
+        for slot in self._at(indices):
+            setattr(slot, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method of the batch; its result, once a slot."""
-        result = getattr(self.env, method_name)(*method_args, **method_kwargs)
-        return [result] * len(list(self._get_indices(indices)))
+        """Call a method of each slot: those of :class:`Slot`."""
+        return [getattr(slot, method_name)(*method_args, **method_kwargs) for slot in self._at(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """Whether the slots do what a wrapper does: each reports its episodes as ``Monitor`` does."""
-        return [wrapper_class is Monitor] * len(list(self._get_indices(indices)))
+        return [wrapper_class is Monitor for _ in self._at(indices)]
+
+    def _at(self, indices: Any) -> list[Slot]:
+        return [self.slots[i] for i in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """The native batch does not render."""
         return [None] * self.num_envs
+
+
+class Slot:
+    """One crystal of a :class:`CzVecEnv`, as ``get_attr``, ``set_attr`` and ``env_method`` reach it.
+
+    It has the methods of :class:`cz_gym.CzEnv` that concern one crystal alone, and the attributes of the batch.
+    """
+
+    def __init__(self, among: CzVecEnv, i: int) -> None:
+        self._among, self._i = among, i
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Draw this slot's next episode, as :meth:`cz_gym.CzEnv.reset`; the others go on."""
+        among, i, n = self._among, self._i, self._among.num_envs
+        given = {**(options or {}), "reset_mask": np.arange(n) == i}
+        given |= {"state": (given["state"],) * n} if "state" in given else {}
+        observation, info = among.env.reset(seed=[seed] * n, options=given)
+        among._returns[i] = among._lengths[i] = 0
+        own = {name: values[i] for name, values in info.items() if f"_{name}" in info}
+        return among._shown(observation, info)[i], own
+
+    def get_state(self) -> EnvState:
+        """The state of this slot alone (:meth:`cz_gym.CzEnv.get_state`)."""
+        return self._among.env.get_state()[self._i]
+
+    def set_state(self, state: EnvState) -> None:
+        """Continue this slot from a state (:meth:`cz_gym.CzEnv.set_state`)."""
+        self.reset(options={"state": state})
+
+    def __getattr__(self, name: str) -> Any:
+        batch, own = self._among.env, {"observation_space", "action_space"}
+        value = getattr(self._among if name in own else batch, name)
+        if name.startswith("_") or callable(value):
+            raise AttributeError(f"a slot has no {name!r}; its methods are reset, get_state and set_state")
+        return value[self._i] if name.startswith("np_random") else value
 
 
 class ActionRepeat(VecEnvWrapper):

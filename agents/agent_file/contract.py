@@ -1,7 +1,5 @@
 """The contract of an agent file, the JSON beside each ONNX file; and reading and writing both."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -179,17 +177,17 @@ def _parse(path: Path) -> Contract:
 def _check(given: Mapping[str, Any], where: Path | str) -> None:
     """AgentFileError unless every value is one that the contract's field may hold."""
     for field in fields(Contract):
-        if wrong := _wrong(str(field.type), given[field.name]):
+        if wrong := _wrong(field.type, given[field.name]):
             raise AgentFileError(f"{where}: field {field.name!r} must be {wrong}, not {given[field.name]!r:.80}")
 
 
-def _wrong(kind: str, value: Any) -> str | None:
-    """What is wrong with a value of this kind: the text after "must be"; None if nothing is."""
-    if kind == "str":
+def _wrong(kind: Any, value: Any) -> str | None:
+    """What is wrong with a value of this type: the text after "must be"; None if nothing is."""
+    if kind is str:
         plain = isinstance(value, str) and 0 < len(value) <= MAX_TEXT and value.isprintable() and "|" not in value
         return None if plain else f"printable text of 1 to {MAX_TEXT} characters without |"  # it stands in tables
-    if isinstance(value, bool) or not isinstance(value, int if kind == "int" else (int, float)):
-        return kind
+    if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
+        return str(kind.__name__)
     if isinstance(value, int):
         return None if 0 <= value <= MAX_WHOLE else f"between 0 and {MAX_WHOLE}"
     if not math.isfinite(value):

@@ -5,8 +5,6 @@ bound is known before anything is computed: no operator loops, branches, reads o
 its inputs say, and a puller's action depends on that puller's row alone.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -14,8 +12,9 @@ import numpy as np
 from cz_gym.errors import CzError
 
 OPERATORS = (
-    "Add", "Clip", "Concat", "Div", "Elu", "Gather", "Gemm", "Identity", "LeakyRelu", "MatMul", "Mul", "Neg", "Relu",
-    "Sigmoid", "Slice", "Softplus", "Split", "Sqrt", "Sub", "Tanh",
+    "Abs", "Add", "Celu", "Clip", "Concat", "Div", "Elu", "Erf", "Gather", "Gemm", "HardSigmoid", "HardSwish",
+    "Identity", "LayerNormalization", "LeakyRelu", "MatMul", "Mul", "Neg", "PRelu", "Relu", "Selu", "Sigmoid", "Slice",
+    "Softplus", "Split", "Sqrt", "Sub", "Tanh",
 )  # fmt: skip
 """Operators an agent may use, of the standard ONNX domain."""
 OPSETS = range(13, 22)
@@ -166,7 +165,10 @@ def _check_shapes(graph: Any) -> None:
         given = [name for name in node.input if name in rows]
         ranks, per_row = {len(shapes[name]) for name in given}, bool(given)
         # With other ranks, or on the right of a matrix product, n would meet another axis than its own.
-        if len(ranks) > 1 or (node.op_type in ("MatMul", "Gemm") and node.input[1] in rows and ranks == {2}):
+        product = node.op_type in ("MatMul", "Gemm") and node.input[1] in rows and ranks == {2}
+        axis = next((each.i for each in node.attribute if each.name == "axis"), -1)
+        across = node.op_type == "LayerNormalization" and (axis != -1 or len(node.output) > 1)
+        if len(ranks) > 1 or product or across:
             raise GraphError(f"its {node.op_type} may mix the rows of different pullers")
         for name in filter(None, node.output):
             dims = [dim.dim_param or dim.dim_value for dim in shapes.get(name, ())]

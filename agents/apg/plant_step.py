@@ -1,7 +1,5 @@
 """A step of the batch as a function that torch differentiates, for networks of any shape, and the cost of a step."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

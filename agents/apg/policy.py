@@ -1,7 +1,5 @@
 """A recurrent policy on "measured": leaky means of the readings, a gated recurrent unit and a small network."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 

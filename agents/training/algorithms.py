@@ -1,7 +1,5 @@
 """From a recipe to an algorithm with stable-baselines3's interface, on the native batch."""
 
-from __future__ import annotations
-
 import inspect
 from dataclasses import asdict
 from functools import partial

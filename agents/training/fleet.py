@@ -1,7 +1,5 @@
 """Training seeds side by side, each a run in its own folder, in processes of this machine."""
 
-from __future__ import annotations
-
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """Learning curves: validation error against steps and time, beside the classical controllers on the same crystals."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

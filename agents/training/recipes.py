@@ -4,8 +4,6 @@ A new recipe needs a line in :data:`RECIPES`; a new kind needs a dataclass here 
 :func:`.algorithms.make_algorithm`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from cz_gym.config import Config, make_config

@@ -1,7 +1,5 @@
 """A training run in its folder: settings and provenance, checkpoints, the best agent so far, progress."""
 
-from __future__ import annotations
-
 import signal
 import sys
 import threading
@@ -29,7 +27,7 @@ from .recipes import PPO, Recipe
 from .run_files import check_settings, identity, provenance, read_rows, to_csv, to_json
 from .validation import COLUMNS, REFERENCES, References, validate
 
-CHECKPOINT = "checkpoint.safetensors"
+CHECKPOINT = "checkpoint.zip"
 VALIDATE_EVERY = 200_000
 """Least number of steps between validations."""
 MAX_SESSIONS = 100
@@ -80,12 +78,12 @@ class Run:
         self.best: float | None = None
         self.began, sessions = time.monotonic(), job.sessions
         if sessions:
-            progress, tensors, self.files = load_checkpoint(folder / CHECKPOINT)
+            progress, learned, self.files = load_checkpoint(folder / CHECKPOINT)
             write_files({folder / name: content for name, content in self.files.items()})
             self.rows, self.best = read_rows(folder / "progress.csv"), progress.best_cost
             self.began -= progress.seconds
             self.algorithm = make_algorithm(recipe, seed, progress.steps)
-            restore(self.algorithm, tensors, folder / CHECKPOINT)
+            restore(self.algorithm, progress, learned, folder / CHECKPOINT)
             self.saved, self.saved_steps = time.monotonic(), self.steps
         else:
             self.algorithm = make_algorithm(recipe, seed)

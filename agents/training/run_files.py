@@ -1,7 +1,5 @@
 """The files of a run's folder beside its checkpoint: settings with provenance, and the progress of validations."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

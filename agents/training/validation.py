@@ -1,7 +1,5 @@
 """Cost, radius error and losses of an agent on validation crystals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple

@@ -106,7 +106,7 @@ def _agree(sample: Sample, earlier: Floats) -> bool:
 @cache
 def code_behind(module: str) -> str:
     """Hash of all code that the episodes of a policy of that module come from, comments and docstrings left out."""
-    return hash_files(sources_behind(module), code_only=True)
+    return hash_files(sources_behind(module))
 
 
 def sources_behind(module: str) -> list[Path]:

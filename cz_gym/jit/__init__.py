@@ -1,7 +1,5 @@
 """Compilation: marks for functions that compile into the loops, and where compiled code is kept."""
 
-from __future__ import annotations
-
 import os
 
 # Intel's vector mathematics, where numba finds it, rounds otherwise than libm: results would depend on the machine.

@@ -6,8 +6,6 @@ Here a file is named by the types that it was compiled for, repeats them inside,
 be loaded is compiled again. A file is trusted as those of ``__pycache__`` are.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import pickle
@@ -33,7 +31,8 @@ PACKAGE = Path(__file__).parents[1]
 CACHE_VARIABLE = "CZ_GYM_CACHE_DIR"
 """Environment variable naming the folder for compiled code; empty means: keep none."""
 NEVER_COMPILED = (
-    "agents", "baselines", "evaluation", "machine/export", "machine/pullers", "machine/serve", "play.py", "testing",
+    "agents", "baselines", "datasets.py", "evaluation", "machine/export", "machine/pullers", "machine/serve", "play.py",
+    "rendering", "sb3.py", "support/command_line.py", "testing",
 )  # fmt: skip
 """Parts of the package of which nothing is compiled in; all others count, whatever they hold."""
 FunctionCache: Any = caching.FunctionCache
@@ -49,7 +48,7 @@ def compiled_sources(folder: Path | None = None) -> list[Path]:
 
 
 def source_hash(folder: Path | None = None) -> str:
-    """SHA-256 of the names and contents of :func:`compiled_sources` (32 hex digits)."""
+    """Hash of the names and the code of :func:`compiled_sources` (32 hex digits)."""
     return hash_files(compiled_sources(folder))
 
 

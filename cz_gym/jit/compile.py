@@ -6,14 +6,13 @@ the outermost function, so a changed equation in another module would run the ol
 named by a hash of every source of the package that can be compiled in.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from inspect import signature
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.datamodel import models
@@ -32,6 +31,8 @@ from numba.extending import (
 from .cache import CachedCode, cache_folder
 
 F = TypeVar("F", bound=Callable[..., Any])
+UNCOMPILED = bool(cast(Any, numba.config).DISABLE_JIT)
+"""Whether the user has turned numba off by NUMBA_DISABLE_JIT: loops are then run by Python, a thousand times slower."""
 
 
 def jittable(function: F) -> F:
@@ -62,6 +63,13 @@ def kernel(function: F, keep: bool = True, allocates: bool = True) -> F:
     ``keep=False`` caches nothing: for loops over functions from elsewhere, whose changes no hash would see.
     ``allocates=False`` promises that the loop makes no array, so that views of its arguments need no reference counts.
     """
+    if UNCOMPILED:
+
+        def uncompiled(*arguments: Any) -> Any:
+            with np.errstate(all="ignore"):
+                return function(*map(_as_records, arguments))
+
+        return cast(F, uncompiled)
     folder = cache_folder() if keep else None
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"} | ({} if allocates else {"_nrt": False})
     compiled, settings = cast(Any, numba.njit(**options)(function)), cast(Any, numba.config)
@@ -71,6 +79,14 @@ def kernel(function: F, keep: bool = True, allocates: bool = True) -> F:
             compiled._cache = CachedCode(function)
         settings.CACHE_DIR = previous
     return cast(F, compiled)
+
+
+def _as_records(argument: Any) -> Any:
+    """An array of records, alone or in named tuples, as one whose fields are attributes, as in compiled code."""
+    if hasattr(argument, "_fields"):
+        return type(argument)(*map(_as_records, argument))
+    records = isinstance(argument, np.ndarray) and argument.dtype.names
+    return argument.view(np.recarray) if records else argument
 
 
 def entry(loop: Any, arguments: tuple[Any, ...]) -> Any:
@@ -249,7 +265,7 @@ def _on_stack(typing_context: Any, rows: Any, columns: Any) -> Any:
     return array(rows, columns), generate
 
 
-scratch: Callable[[int, int], Any] = _on_stack  # type: ignore[assignment]
+scratch: Callable[..., Any] = (lambda *shape: np.empty(shape)) if UNCOMPILED else _on_stack
 """``scratch(rows, columns)``, in a kernel alone: an array of numbers, not set, on the stack until the function returns.
 
 Nothing is allocated, and the compiler knows that nothing else lies there. Rows and columns are constants.

@@ -1,6 +1,7 @@
 """Command lines of the project: errors that are meant for the user, and interrupts, print one line."""
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from cz_gym.errors import CzError
 OPTIONAL = (
     "aiohttp", "array_api_compat", "asyncua", "blark", "casadi", "control", "envpool", "filelock", "fmpy", "h5py",
     "matplotlib", "minari", "onnx", "onnxruntime", "pandas", "pcgym", "plotly", "pyarrow", "pygame", "pythonfmu",
-    "safetensors", "sb3_contrib", "selenium", "stable_baselines3", "tensorboard", "torch", "tqdm",
+    "sb3_contrib", "selenium", "stable_baselines3", "tensorboard", "torch", "tqdm",
 )  # fmt: skip
 """Modules of the packages in the extras of ``pyproject.toml``."""
 
@@ -67,6 +68,7 @@ def guarded(prog: str, body: Callable[[], int], extra: str, left: str = "nothing
     exception is a bug, the user's or ours, and keeps its traceback. ``extra`` names the extras of what the command
     imports, ``left`` says what an interrupt leaves behind.
     """
+    os.environ["MPLBACKEND"] = "agg"  # commands draw files; a notebook's backend may be missing here
     try:
         return body()
     except (CzError, DependencyNotInstalled) as error:

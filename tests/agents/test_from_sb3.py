@@ -15,24 +15,29 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor, VecNormalize
+from torch import nn
 
 from cz_gym import CzEnv, sb3
 from cz_gym.agents import AgentFileError, OnnxPolicy, from_sb3
+from cz_gym.agents.agent_file.contract import make_contract
 from cz_gym.agents.apg import APG
 from cz_gym.agents.export import to_onnx
 from cz_gym.config import make_config
+from cz_gym.machine.export.agent import network_of
+from cz_gym.machine.export.trace import Graph
+from tests.contracts import facts
 
 pytestmark = pytest.mark.usefixtures("few_crystals")
 ON = {"n_steps": 16, "batch_size": 32, "n_epochs": 1}
 OFF = {"learning_starts": 8, "buffer_size": 64, "batch_size": 8}
 KINDS = {
-    "a2c": (A2C, "MlpPolicy", {"policy_kwargs": {"activation_fn": torch.nn.ELU}}),
+    "a2c": (A2C, "MlpPolicy", {"policy_kwargs": {"activation_fn": nn.ELU}}),
     "ddpg": (DDPG, "MlpPolicy", OFF),
     "ppo": (PPO, "MlpPolicy", ON),
     "ppo_lstm": (RecurrentPPO, "MlpLstmPolicy", ON),
     "sac": (SAC, "MlpPolicy", OFF),
     "sac with a clipped mean": (SAC, "MlpPolicy", {**OFF, "use_sde": True}),
-    "td3": (TD3, "MlpPolicy", {**OFF, "policy_kwargs": {"activation_fn": torch.nn.SiLU}}),
+    "td3": (TD3, "MlpPolicy", {**OFF, "policy_kwargs": {"activation_fn": nn.SiLU}}),
     "tqc": (TQC, "MlpPolicy", OFF),
 }
 
@@ -199,15 +204,39 @@ class Own(BaseFeaturesExtractor):
         return torch.sin(observations)
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [({"features_extractor_class": Own}, "operator 'Sin'"), ({"activation_fn": torch.nn.GELU}, "operator 'Erf'")],
-)
-def test_a_network_that_cannot_be_written_is_refused(options, said, tmp_path):
-    model = PPO("MlpPolicy", "Cz-v0", device="cpu", n_steps=8, batch_size=8, policy_kwargs=options)
-    with pytest.raises(AgentFileError, match=said):
+def test_a_network_that_cannot_be_written_is_refused(tmp_path):
+    options = {"policy_kwargs": {"features_extractor_class": Own}}
+    model = PPO("MlpPolicy", "Cz-v0", device="cpu", n_steps=8, batch_size=8, **options)
+    with pytest.raises(AgentFileError, match="operator 'Sin'"):
         from_sb3.save_agent(tmp_path / "mine.onnx", model, "mine")
     assert not list(tmp_path.iterdir())
+
+
+LAYERS = {
+    name: getattr(nn, name)
+    for name in (
+        "CELU", "ELU", "GELU", "Hardsigmoid", "Hardswish", "Hardtanh", "LeakyReLU", "Mish", "PReLU", "ReLU6",
+        "SELU", "SiLU", "Softplus", "Softsign", "Tanhshrink",
+    )
+} | {"LayerNorm": lambda: nn.LayerNorm(8)}  # fmt: skip
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+def test_usual_layers_act_alike_in_torch_in_the_file_and_in_its_export(layer, tmp_path):
+    """The export to other languages records the same graph in NumPy, in double precision."""
+    arch = {"activation_fn": LAYERS[layer], "net_arch": [8]}
+    policy = PPO("MlpPolicy", "Cz-v0", seed=0, device="cpu", n_steps=8, batch_size=8, policy_kwargs=arch).policy
+    with torch.no_grad():
+        policy.action_net.weight *= 30.0
+    seen = np.random.default_rng(0).normal(0.0, 2.0, (50, 72)).astype(np.float32)
+    content = to_onnx(policy, 72)
+    agent = OnnxPolicy.of(make_contract(content, **facts()), content)
+    wanted = policy.predict(seen, deterministic=True)[0]
+    assert np.abs(wanted).max() > 0.2
+    assert agent.predict(seen)[0] == pytest.approx(wanted, abs=1e-5)
+    network = network_of(content)
+    assert network(observation=seen.astype(np.float64))[0] == pytest.approx(wanted, abs=1e-5)
+    assert network(observation=Graph().input("observation", (1, 72)))[0].shape == (1, 2)
 
 
 def test_a_file_that_would_act_otherwise_is_not_written(tmp_path):

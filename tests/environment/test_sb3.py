@@ -9,6 +9,7 @@ import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
@@ -96,13 +97,40 @@ def test_staggered_first_episodes_end_at_different_times():
     assert sum(ends) >= 64
 
 
-def test_the_adapter_has_the_attributes_and_methods_of_a_vec_env():
-    env = adapter()
-    assert [config.steps for config in env.get_attr("config")] == [20] * N
-    assert len(env.get_attr("config", [0, 2])) == 2
-    assert env.env_is_wrapped(CzEnv) == [False] * N
-    with pytest.raises(ValueError, match="no indices"):
-        env.set_attr("render_mode", None, [0])
+def test_methods_and_attributes_reach_the_slots_that_are_named_as_in_sb3s_own_vectors():
+    """The kind of stable-baselines (hill-a) #675: env_method("reset", indices=[1]) reset every slot."""
+    ours, theirs = adapter(), DummyVecEnv([lambda: Monitor(CzEnv(**SETTINGS))] * N)
+    action = np.full((N, 2), 0.02, np.float32)
+
+    def both(said):
+        one, other = said(ours), said(theirs)
+        np.testing.assert_equal(one, other)
+        return one
+
+    both(lambda env: env.seed(5))
+    both(lambda env: env.reset())
+    both(lambda env: env.step(action)[:3])
+    ((seen, info),) = both(lambda env: env.env_method("reset", seed=8, indices=[1]))
+    assert (seen.shape, set(info)) == ((72,), {"r_c", "r_ref"})
+    both(lambda env: env.env_method("reset", options={"scenario": "nominal"}, indices=2))
+    assert len(both(lambda env: env.env_method("reset"))) == N
+    saved = ours.env_method("get_state", indices=[0])
+    for env in (ours, theirs):
+        env.env_method("set_state", *saved, indices=range(1, N))
+    for _ in range(21):
+        ends = [[info.get("episode", {}) for info in env.step(action)[3]] for env in (ours, theirs)]
+        for one, other in zip(*ends, strict=True):
+            assert (one.get("l"), one.get("r")) == (other.get("l"), pytest.approx(other.get("r"), abs=1e-5))
+    both(lambda env: env.set_attr("lesson", 3, indices=[0, 2]))
+    assert both(lambda env: env.get_attr("lesson", [0, 2])) == [3, 3]
+    assert not both(lambda env: env.has_attr("lesson"))
+    assert [config.steps for config in both(lambda env: env.get_attr("config", [2]))] == [20]
+    for name in ("action_space", "np_random_seed", "observation_space", "render_mode"):
+        both(lambda env, name=name: env.get_attr(name))
+    for kind in (Monitor, VecNormalize):
+        both(lambda env, kind=kind: env.env_is_wrapped(kind, indices=[1, 2]))
+    with pytest.raises(AttributeError, match="no 'step'; its methods are reset, get_state and set_state"):
+        ours.env_method("step", action[0], indices=0)
 
 
 @pytest.mark.parametrize("observation", ["measured", "history", "state"])

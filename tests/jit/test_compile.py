@@ -11,7 +11,7 @@ import pytest
 from cz_gym import HURLE
 from cz_gym.body.process import BODY
 from cz_gym.engine.kernels import build_kernels
-from cz_gym.jit.cache import CachedCode, Store, cache_folder
+from cz_gym.jit.cache import CachedCode, Store, cache_folder, source_hash
 from cz_gym.jit.compile import jittable, kernel
 from cz_gym.physics.meniscus import hurle_height
 from tests.processes import ROOT, python
@@ -55,6 +55,23 @@ def test_changed_physics_is_never_run_from_an_old_cache(package, tmp_path):
     other, changed, hits = run(FACTOR, package, cache)
     assert float(changed) == pytest.approx(0.01 + float(factor))
     assert (other != folder, hits) == (True, "0")
+
+
+@pytest.mark.parametrize(
+    ("file", "before", "after", "same"),
+    [
+        ("physics/meniscus.py", '"""', '"""Edited: ', True),
+        ("rendering/scene.py", "import", "SIZE = 1.0\nimport", True),
+        ("physics/meniscus.py", "B = 1.0", "B = 1.01", False),
+        ("physics/young_laplace.json", "1", "2", False),
+    ],
+)
+def test_only_code_that_may_be_compiled_in_is_another_cache(file, before, after, same, package):
+    module, hash_before = package / "cz_gym" / file, source_hash(package / "cz_gym")
+    text = module.read_text()
+    module.write_text(text.replace(before, after, 1))
+    assert module.read_text() != text
+    assert (source_hash(package / "cz_gym") == hash_before) is same
 
 
 @pytest.mark.slow

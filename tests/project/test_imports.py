@@ -105,3 +105,11 @@ def test_importing_loads_nothing_that_is_not_needed_and_no_module_has_a_second_n
     told = python("-W", "error", "-c", "\n".join(code))
     assert "import cz_gym.baselines" in told
     assert "import cz_gym.agents" in told
+
+
+def test_only_agents_import_torch():
+    """``cz_gym.sb3`` adapts stable-baselines3, which imports it by itself."""
+    named = {name: {each.partition(".")[0] for each in imports(name, file)} for name, file in modules().items()}
+    below = {name for name in named if within(name, "cz_gym") and not within(name, "cz_gym.agents")}
+    assert [name for name in below if "torch" in named[name]] == []
+    assert [name for name in below if "stable_baselines3" in named[name]] == ["cz_gym.sb3"]

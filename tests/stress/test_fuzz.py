@@ -3,9 +3,11 @@
 ``pytest tests/stress/test_fuzz.py --hypothesis-profile long`` is the long form.
 """
 
+import io
 import json
 import os
 import resource
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +18,7 @@ from hypothesis import strategies as st
 
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
 from cz_gym.agents.agent_file.contract import make_contract, read_agent
-from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
+from cz_gym.agents.training.checkpoint import PROGRESS, load_checkpoint, restore, to_bytes
 from cz_gym.agents.training.run_files import COLUMNS, read_rows, read_settings
 
 SPARE = 1_000_000_000
@@ -56,14 +58,14 @@ def known(ppo, tmp_path_factory):
         return Target(seed, lambda content: ((folder / name).write_bytes(content), read(folder / name)))
 
     def restored(path):
-        restore(ppo, load_checkpoint(path)[1], path)
+        restore(ppo, *load_checkpoint(path)[:2], path)
 
     targets = {
         "agent.onnx": Target(network, lambda content: OnnxPolicy.of(make_contract(content, **facts), content)),
         "agent.json": kept(
             shipped().with_suffix(".json").read_bytes(), "agent.json", lambda _: read_agent(folder / "agent.onnx")
         ),
-        "checkpoint": kept(to_bytes(ppo, 1.0, 0.5), "ppo.safetensors", restored),
+        "checkpoint": kept(to_bytes(ppo, 1.0, 0.5), "ppo.zip", restored),
         "settings.json": kept(settings.encode(), "settings.json", read_settings),
         "progress.csv": kept(progress.encode(), "progress.csv", read_rows),
     }
@@ -114,17 +116,20 @@ def odd_json(draw, seed):
 
 
 @st.composite
-def odd_header(draw, seed):
-    """A checkpoint whose list of tensors says something else than it holds, or names another."""
-    size = int.from_bytes(seed[:8], "little")
-    text = seed[8 : 8 + size]
-    text = draw(st.just(text.replace(b"weight", b"height", 1)) | odd_json(text))
-    said = draw(st.sampled_from((len(text), size, 2**62)))
-    return said.to_bytes(8, "little") + text + seed[8 + size :]
+def odd_archive(draw, seed):
+    """A checkpoint of which one member is another, with the right check sum."""
+    with zipfile.ZipFile(io.BytesIO(seed)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = draw(st.sampled_from([PROGRESS, "policy.pth", "policy.optimizer.pth"]))
+    members[name] = draw((odd_json if name == PROGRESS else odd_bytes)(members[name]))
+    with zipfile.ZipFile(content := io.BytesIO(), "w") as archive:
+        for name, member in members.items():
+            archive.writestr(name, member)
+    return content.getvalue()
 
 
 MUTANTS = {
-    "agent.onnx": odd_bytes, "agent.json": odd_json, "checkpoint": odd_header, "settings.json": odd_json,
+    "agent.onnx": odd_bytes, "agent.json": odd_json, "checkpoint": odd_archive, "settings.json": odd_json,
     "progress.csv": odd_bytes,
 }  # fmt: skip
 

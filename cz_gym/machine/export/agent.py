@@ -31,6 +31,27 @@ def _split(x: Any, lengths: Any = None, axis: int = 0, parts: int = 1) -> Any:
     return np.split(x, parts if lengths is None else np.cumsum(lengths)[:-1].tolist(), axis)
 
 
+def _layer_norm(x: Any, scale: Any, bias: Any = 0.0, epsilon: float = 1e-5, **_: Any) -> Any:
+    mean = np.full((x.shape[-1], 1), 1.0 / x.shape[-1])
+    apart = x - x @ mean
+    return apart / np.sqrt(apart * apart @ mean + epsilon) * scale + bias
+
+
+def _erf(x: Any) -> Any:
+    """The error function to 1.5e-7: formula 7.1.26 of Abramowitz and Stegun."""
+    t = 1.0 / (1.0 + 0.3275911 * np.absolute(x))
+    series = ((((1.061405429 * t - 1.453152027) * t + 1.421413741) * t - 0.284496736) * t + 0.254829592) * t
+    return np.where(x > 0.0, 1.0, -1.0) * (1.0 - series * np.exp(-x * x))
+
+
+def _elu(x: Any, alpha: float = 1.0) -> Any:
+    return np.where(x > 0.0, x, alpha * (np.exp(np.minimum(x, 0.0)) - 1.0))
+
+
+def _leaky(x: Any, alpha: Any = 0.01) -> Any:
+    return np.where(x > 0.0, x, alpha * x)
+
+
 OPERATORS: dict[str, Callable[..., Any]] = {
     "Add": np.add, "Sub": np.subtract, "Mul": np.multiply, "Div": np.divide, "Neg": np.negative, "Sqrt": np.sqrt,
     "Tanh": np.tanh, "MatMul": np.matmul, "Gemm": _gemm, "Slice": _slice, "Split": _split,
@@ -39,8 +60,11 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     "Gather": lambda x, at, axis=0: np.moveaxis(np.moveaxis(x, axis, 0)[at], 0, axis),
     "Relu": lambda x: np.maximum(x, 0.0), "Sigmoid": lambda x: 0.5 + 0.5 * np.tanh(0.5 * x),
     "Softplus": lambda x: np.maximum(x, 0.0) + np.log(1.0 + np.exp(-np.absolute(x))),
-    "LeakyRelu": lambda x, alpha=0.01: np.where(x > 0.0, x, alpha * x),
-    "Elu": lambda x, alpha=1.0: np.where(x > 0.0, x, alpha * (np.exp(np.minimum(x, 0.0)) - 1.0)),
+    "LeakyRelu": _leaky, "PRelu": _leaky, "Elu": _elu, "Celu": lambda x, alpha=1.0: alpha * _elu(x / alpha),
+    "Selu": lambda x, alpha=1.6732632, gamma=1.050701: gamma * _elu(x, alpha),
+    "HardSigmoid": lambda x, alpha=0.2, beta=0.5: np.clip(alpha * x + beta, 0.0, 1.0),
+    "HardSwish": lambda x: x * np.clip(x / 6.0 + 0.5, 0.0, 1.0),
+    "Abs": np.absolute, "Erf": _erf, "LayerNormalization": _layer_norm,
 }  # fmt: skip
 """The operators that an agent's graph may hold, :data:`cz_gym.agents.agent_file.graph.OPERATORS`, in NumPy."""
 

@@ -7,17 +7,11 @@ import numpy as np
 import onnx
 import pytest
 
-from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
+from cz_gym.agents import AgentFileError, OnnxPolicy
 from cz_gym.agents.agent_file.contract import MAX_BYTES, write_agent
 from cz_gym.agents.export import to_onnx
-from cz_gym.baselines import CompensatedPID
-from cz_gym.config import make_config
-from cz_gym.evaluation.metrics import metrics
-from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import HISTORY
 from tests.contracts import facts
-
-CONFIG = make_config(observation="history")
 
 
 @pytest.fixture
@@ -106,12 +100,3 @@ def test_an_oversized_file_is_refused(agent):
     agent.write_bytes(b"0" * (MAX_BYTES + 1))
     with pytest.raises(AgentFileError, match="larger than"):
         OnnxPolicy.load(agent)
-
-
-def test_shipped_agent_beats_the_paper_s_controller_on_validation():
-    seeds = range(1_000_000, 1_000_030)
-    policy = OnnxPolicy.load(shipped(), CONFIG)
-    agent, paper = (metrics(rollout(each, make_config(**each.settings), seeds)) for each in (policy, CompensatedPID()))
-    assert agent.rmse_mm.mean() < 0.3 * paper.rmse_mm.mean()
-    assert agent.failure_rate.sum() == 0
-    assert agent.pull_step_rms_mm_per_min.mean() < paper.pull_step_rms_mm_per_min.mean()

@@ -187,6 +187,12 @@ HOSTILE = {
         ),
         "may mix the rows",
     ),
+    "norms over pullers": (
+        lambda: written(
+            "x = LayerNormalization <axis = 0> (observation, s) action = MatMul(x, weight)", s=np.ones(1, np.float32)
+        ),
+        "may mix the rows",
+    ),
     "two pullers read as two numbers": (
         lambda: written(
             """linear = Gemm(observation, weight, bias) pairs = Gather <axis = 1> (linear, both)
