@@ -13,7 +13,7 @@ from cz_gym.physics.parameters import describe
 from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN, PERCENT
 
 from .estimate import WHITE, Estimate, Identified
-from .log import Log
+from .grid import Log
 
 CALLIPER = 0.05 * MM
 """Error of a calliper's reading of the radius [m]."""

@@ -66,7 +66,7 @@ def test_a_log_of_a_controller_alone_tells_nothing(logs):
 def test_a_log_quicker_than_its_controller_is_no_more_excited(logs):
     for path, enough in zip(logs, (True, False), strict=True):
         log = read_log(path)
-        quick = log._replace(**{name: np.repeat(getattr(log, name), 5) for name in Log._fields[:8]}, interval=1.0)
+        quick = log._replace(**{name: np.repeat(getattr(log, name), 5) for name in Log._fields[:9]}, interval=1.0)
         assert (min(measure_excitation(quick, DEFAULT)) > 1.0) is enough
         assert (max(measure_excitation(quick, DEFAULT)) > 1.0) is enough
 
