@@ -37,6 +37,8 @@ WIDER = 1.3
 studies.identify`` counts the intervals that hold the truth."""
 INFORMED = 0.5
 """An informed parameter keeps less than this share of the prior's standard deviation [-]."""
+AT_REST = 8, 0.02
+"""The search ends where as many steps have gained less; a dead time of whole rows is a kink, where it cannot but stop."""
 CAUTIOUS = {"pyrometer_sd": 20.0, "camera_sd": 4.0}
 """Factors on the noise where the search begins, so that the filter of a wrong puller can follow the log."""
 
@@ -98,6 +100,14 @@ class Identified:
         parameters = {name: value for name, value in sure.items() if name in Parameters._fields}
         own: dict[str, Any] = {name: (value, value) for name, value in ranges.items()}
         return replace(self.start, parameters=self.start.parameters._replace(**parameters), **own)
+
+    @property
+    def verdict(self) -> str:
+        """One line: whether the model fits the log, or why it does not."""
+        if self.misfits:
+            return f"THE MODEL DOES NOT FIT: {'; '.join(self.misfits)}"
+        moved = [drive for drive, share in zip(("pull speed", "heater"), self.excitation, strict=True) if share >= 1.0]
+        return f"the model fits the log; moves of their own: {', '.join(moved) or 'none, so the log tells nothing'}"
 
     @property
     def delayed(self) -> bool:
@@ -220,10 +230,18 @@ def _maximise(logs: Sequence[Log], model: Model, sd: Floats) -> Maximum:
         return lambda x: posterior(x.tobytes())[index]
 
     away, settled = _plausible_start(logs, model, sd), False
-    if np.isfinite(posterior(away.tobytes())[0]):
-        options = {"gtol": 0.1, "maxiter": 100}
-        search = minimize(part(0), away, jac=part(1), hess=part(2), method="trust-exact", options=options)
-        away, settled = search.x, bool(search.success)
+    values = [posterior(away.tobytes())[0]]
+
+    def stop_at_rest(intermediate_result: Any) -> None:
+        values.append(float(intermediate_result.fun))
+        if len(values) > AT_REST[0] and values[-AT_REST[0]] - values[-1] < AT_REST[1]:
+            raise StopIteration
+
+    if np.isfinite(values[0]):
+        options: Any = {"gtol": 0.1, "maxiter": 100}
+        how: Any = {"jac": part(1), "hess": part(2), "method": "trust-exact", "callback": stop_at_rest}
+        away = minimize(part(0), away, options=options, **how).x
+        settled = len(values) <= options["maxiter"]
     _, _, curvature, out = posterior(away.tobytes())
     return Maximum(model.mean + away * sd, WIDER**2 * np.linalg.inv(curvature) * np.outer(sd, sd), out, settled)
 

@@ -22,8 +22,8 @@ LONG_GAP = 20.0
 OUTLIERS = {
     "ring_radius_mm": (11, 6.0, 0.02 * MM, 0.0),
     "T_1_K": (11, 6.0, 1.0, 0.0),
-    "pull_speed_mm_per_min": (5, 6.0, 0.0, 0.1),
-    "heater_power_kW": (5, 6.0, 0.0, 0.1),
+    "pull_speed_mm_per_min": (5, 6.0, 0.0, 0.3),
+    "heater_power_kW": (5, 6.0, 0.0, 0.3),
 }
 """Readings count as outliers that lie as many robust deviations from the median of their neighbours (Hampel's filter):
 neighbours, deviations, and the least deviation that counts, in the column's SI unit and as a share of its median. A
@@ -143,7 +143,7 @@ def on_grid(table: Any, notes: dict[str, int]) -> Log:
 def _outliers(values: Any, name: str) -> Any:
     neighbours, deviations, least, share = OUTLIERS[name]
     middle = abs(values.median())
-    absurd = (values < middle / ABSURD) | (values > middle * ABSURD) if name not in DRIVES else values != values
+    absurd = ((values < middle / ABSURD) | (values > middle * ABSURD)) & (name not in DRIVES)
     rest = values.mask(absurd)
     away = (rest - rest.rolling(neighbours, center=True, min_periods=int(0.8 * neighbours)).median()).abs()
     return absurd | (away > max(deviations * max(1.4826 * away.median(), least), share * middle))

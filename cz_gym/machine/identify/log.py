@@ -83,7 +83,7 @@ def read_log(path: str | Path, columns: Mapping[str, tuple[str, str]] | None = N
         raise CzError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
 
 
-def check_puller(log: Log, machine: PullerFile) -> None:
+def check_puller(log: Log, machine: PullerFile, source: str = "the log") -> None:
     """Raise CzError for a log in other units than it says, or of another puller."""
     puller = make_puller(machine.parameters)
     for name, values, low, high in (
@@ -100,7 +100,9 @@ def check_puller(log: Log, machine: PullerFile) -> None:
         meant = [unit for unit, value in as_read.items() if low <= value <= high]
         guess = f'did you mean {name}="COLUMN:{meant[0]}"' if meant else "is it another puller's log"
         middle, low, high = (value / own for value in (middle, low, high))
-        raise CzError(f"{name} is {middle:.4g} in the middle, this puller's is {low:.4g} to {high:.4g}: {guess}?")
+        raise CzError(
+            f"{source}: {name} is {middle:.4g} in the middle, this puller's is {low:.4g} to {high:.4g}: {guess}?"
+        )
 
 
 def record_log(env: Any, policy: Any, path: str | Path, seed: int | None = None) -> int:

@@ -15,8 +15,8 @@ from cz_gym.support.units import MINUTE
 
 from .grid import Floats, Log
 
-MOVE, ENOUGH = 0.005, 20 * 0.02**2
-"""Unexplained moves count from this share of nominal on; their squares must add up to those of 20 steps of 2 %."""
+MOVE, ENOUGH = 0.005, 20 * 0.01**2
+"""Unexplained moves count from this share of nominal on; their squares must add up to those of 20 steps of 1 %."""
 WINDOW = MINUTE
 """Time over which moves are summed [s]."""
 SHARE = 0.2

@@ -119,7 +119,7 @@ def _read_times(text: Any, unit: str) -> Any:
         return pandas.to_timedelta(only, errors="coerce").dt.total_seconds()
     if unit not in DATED:
         return pandas.to_numeric(_plain(text), errors="coerce").astype(float) * factor
-    plain = text.where(text.str.contains(r"\d\D+\d")).str.replace(r",(\d+)$", r".\1", regex=True)
+    plain = text.where(text.str.contains(r"\d[-./]\d")).str.replace(r",(\d+)$", r".\1", regex=True)
     how: Any = {"format": "ISO8601"} if unit == "iso" else {"format": "mixed", "dayfirst": unit == "dmy"}
     times = pandas.to_datetime(plain, utc=True, errors="coerce", **how)
     return (times - pandas.Timestamp(0, tz="utc")).dt.total_seconds()
