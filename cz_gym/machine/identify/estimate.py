@@ -38,7 +38,7 @@ studies.identify`` counts the intervals that hold the truth."""
 INFORMED = 0.5
 """An informed parameter keeps less than this share of the prior's standard deviation [-]."""
 AT_REST = 8, 0.02
-"""The search ends where as many steps have gained less; a dead time of whole rows is a kink, where it cannot but stop."""
+"""The search ends where as many steps have gained less: a dead time of whole rows is a kink, where it cannot go on."""
 CAUTIOUS = {"pyrometer_sd": 20.0, "camera_sd": 4.0}
 """Factors on the noise where the search begins, so that the filter of a wrong puller can follow the log."""
 
