@@ -90,11 +90,12 @@ def sound_rows(table: Any, line: int, notes: dict[str, int]) -> Any:
 def _slots(time: Floats, interval: float) -> npt.NDArray[np.int64]:
     """Number of the grid's row that each time belongs to; the grid follows the times slowly, so that jitter does not
     matter."""
-    slots, at = np.zeros(len(time), np.int64), time[0]
+    phases = np.exp(2j * np.pi * (time[:50] - time[0]) / interval)
+    slots, at = np.zeros(len(time), np.int64), time[0] + interval * np.angle(phases.mean()) / (2.0 * np.pi)
     for k in range(1, len(time)):
         steps = round((time[k] - at) / interval)
         slots[k], at = slots[k - 1] + steps, at + steps * interval
-        at += 0.1 * (time[k] - at)
+        at += 0.05 * (time[k] - at)
     return slots
 
 
@@ -102,7 +103,7 @@ def on_grid(table: Any, notes: dict[str, int]) -> Log:
     """The table's rows at equal times, and what was left out or filled."""
     time = table["time_s"].to_numpy()
     steps = np.diff(time)
-    interval = float(steps[steps <= 1.5 * np.median(steps)].mean())
+    interval = float(steps[np.abs(steps / np.median(steps) - 1.0) <= 0.5].mean())
     if not INTERVALS[0] <= interval <= INTERVALS[1]:
         meant = [unit for unit in TIME if unit not in DATED and 0.2 <= interval * TIME[unit][0] <= 60.0]
         hint = f": did you mean time_s=COLUMN:{meant[0]}?" if meant else ""
