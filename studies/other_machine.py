@@ -46,7 +46,8 @@ CASES: dict[str, dict[str, float]] = {
     "pyrometer's filter 20 s": {"pyrometer_filter": 20.0},
     "camera's scale 1 % off": {"camera_scale": 1.01},
     "all of these": {
-        "camera_latency": 4.0, "heater_lag": 10.0, "heater_dead_time": 4.0, "pyrometer_filter": 20.0, "camera_scale": 1.01
+        "camera_latency": 4.0, "heater_lag": 10.0, "heater_dead_time": 4.0, "pyrometer_filter": 20.0,
+        "camera_scale": 1.01,
     },
 }  # fmt: skip
 """What the machine has besides; the start file knows the latency alone."""
@@ -99,7 +100,10 @@ def drawn(number: int) -> dict[str, float]:
     """A machine whose hot zone the start file has wrong by factors of lognormal distribution."""
     random = np.random.default_rng([11, number])
     sds = dict.fromkeys(HOT_ZONE, PRIOR_SD) | dict.fromkeys(MELT, 0.1)
-    return ZONE | {name: ZONE[name] * float(np.exp(sd * random.standard_normal())) for name, sd in sds.items()}
+    zone: dict[str, float] = ZONE | {
+        name: ZONE[name] * float(np.exp(sd * random.standard_normal())) for name, sd in sds.items()
+    }
+    return zone
 
 
 def held(number: int) -> tuple[Identified, list[bool]]:

@@ -133,8 +133,8 @@ def identify(
     """
     logs = (log,) if isinstance(log, Log) else tuple(log)
     sds = _prior_sds(prior_sd or {})
-    moved = tuple(map(float, np.sum([measure_excitation(each, start) for each in logs], axis=0)))
-    free = (*((*HEATER, *LAGS) if moved[1] >= 1.0 else ()), *(PULL if moved[0] >= 1.0 else ()))
+    pull, heater = map(float, np.sum([measure_excitation(each, start) for each in logs], axis=0))
+    free = (*((*HEATER, *LAGS) if heater >= 1.0 else ()), *(PULL if pull >= 1.0 else ()))
     model = Model((*free, *Noise._fields), start.parameters, meniscus, _lags_of(start))
     sd, latency = np.array([sds[name] for name in model.names]), start.latency or 0.0
     rows = [prepare(each, latency) for each in logs]
@@ -157,7 +157,7 @@ def identify(
     read = np.isfinite([whole.T_1, whole.ring]).T
     errors = np.where(read, found.out.error / np.sqrt(found.out.variance), np.nan)
     told, noise = tuple(map(estimate, (*HEATER, *LAGS, *PULL))), tuple(map(estimate, Noise._fields))
-    result = Identified(start, told, noise, moved, errors, found.out, whole, found.settled)
+    result = Identified(start, told, noise, (pull, heater), errors, found.out, whole, found.settled)
     reasons = misfits(
         result, model.puller(found.theta + 0j), dict(zip(model.names, (found.theta - model.mean) / sd, strict=True))
     )

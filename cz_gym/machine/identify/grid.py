@@ -136,9 +136,10 @@ def on_grid(table: Any, notes: dict[str, int]) -> Log:
     unsure = np.stack([_unsure(grid[name], filled[name].to_numpy()) for name in DRIVES], axis=1)
     held = grid[["r_ref_mm", "T_1_ref_K"]].ffill()
     parts = (grid[REQUIRED[1]], *(filled[name] for name in DRIVES), grid["T_1_K"], held["r_ref_mm"], held["T_1_ref_K"])
-    readings, gap = (np.array(part, np.float64) for part in parts), np.isin(np.arange(n), after_gap)
+    readings: list[Any] = [np.array(part, np.float64) for part in parts]
+    gap = np.isin(np.arange(n), after_gap)
     said = tuple(f"{count} {what}" for what, count in notes.items() if count)
-    return Log(interval * np.arange(n, dtype=np.float64), *readings, gap, unsure, interval, said)
+    return Log._make([interval * np.arange(n, dtype=np.float64), *readings, gap, unsure, interval, said, 1])
 
 
 def _outliers(values: Any, name: str) -> Any:
@@ -185,13 +186,13 @@ def prepare(log: Log, latency: float = 0.0) -> Log:
 
 def shift_drives(log: Log) -> Log:
     """The log with its drives a row later."""
-    later = {name: np.append(getattr(log, name)[:1], getattr(log, name)[:-1]) for name in ("v_p", "Q_H")}
-    return log._replace(**later, notes=(*log.notes, "a row's drives act after it: they were moved by a row"))
+    v_p, Q_H = (np.append(drive[:1], drive[:-1]) for drive in (log.v_p, log.Q_H))
+    return log._replace(v_p=v_p, Q_H=Q_H, notes=(*log.notes, "a row's drives act after it: they were moved by a row"))
 
 
 def join(logs: Sequence[Log]) -> Log:
     """Logs one after the other, for pictures."""
     ends = np.cumsum([0.0, *(log.time[-1] + log.interval for log in logs)])
     logs = [log._replace(time=log.time + end) for log, end in zip(logs, ends, strict=False)]
-    arrays = (np.concatenate([getattr(log, name) for log in logs]) for name in Log._fields[:9])
-    return Log(*arrays, logs[0].interval, tuple(note for log in logs for note in log.notes))
+    arrays: list[Any] = [np.concatenate([getattr(log, name) for log in logs]) for name in Log._fields[:9]]
+    return Log._make([*arrays, logs[0].interval, tuple(note for log in logs for note in log.notes), 1])

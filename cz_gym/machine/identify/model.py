@@ -226,7 +226,8 @@ def heating(log: Log, delays: Lags) -> Numbers:
     begins = np.array([keep * arrives[0]])
     follows, _ = lfilter([1.0 - keep], [1.0, -keep], arrives, zi=begins)
     before = np.concatenate([arrives[:1], follows[:-1]])
-    return arrives + (before - arrives) * (1.0 - keep) * delays.heater_lag / dt
+    heats: Numbers = arrives + (before - arrives) * (1.0 - keep) * delays.heater_lag / dt
+    return heats
 
 
 def _sampled(

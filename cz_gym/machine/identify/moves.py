@@ -91,7 +91,7 @@ def _unexplained(drive: Floats, readings: Floats, log: Log) -> Floats:
     return moved if np.linalg.norm(left) > SHARE * np.linalg.norm(usual) else np.zeros(0)
 
 
-def _past(values: Floats, keep: Floats, rows: Floats) -> Floats:
+def _past(values: Floats, keep: Floats, rows: npt.NDArray[np.int64]) -> Floats:
     """Last values and exponential means before each row, shape (rows, (PAST + MEANS) signals)."""
     means = [lfilter([1.0 - k], [1.0, -k], values, axis=0, zi=k * values[:1])[0][rows - 1] for k in keep]
     return np.concatenate([*(values[rows - 1 - lag] for lag in range(PAST)), *means], axis=1)

@@ -85,4 +85,5 @@ def coloured(errors: Floats) -> float:
 
 def _correlations(errors: Floats) -> Floats:
     u = np.nan_to_num(errors - np.nanmean(errors))
-    return np.array([u[lag:] @ u[:-lag] for lag in range(1, LAGS + 1)]) / (u @ u)
+    r: Floats = np.array([u[lag:] @ u[:-lag] for lag in range(1, LAGS + 1)]) / (u @ u)
+    return r
