@@ -135,7 +135,7 @@ def identify(
     sds = _prior_sds(prior_sd or {})
     pull, heater = map(float, np.sum([measure_excitation(each, start) for each in logs], axis=0))
     free = (*((*HEATER, *LAGS) if heater >= 1.0 else ()), *(PULL if pull >= 1.0 else ()))
-    model = Model((*free, *Noise._fields), start.parameters, meniscus, _lags_of(start))
+    model = Model((*free, *Noise._fields), start.parameters, meniscus, _lags_of(start, heater >= 1.0))
     sd, latency = np.array([sds[name] for name in model.names]), start.latency or 0.0
     rows = [prepare(each, latency) for each in logs]
     found = _maximise(rows, model, sd)
@@ -176,9 +176,10 @@ def _prior_sds(given: Mapping[str, float]) -> dict[str, float]:
     return sds
 
 
-def _lags_of(start: PullerFile) -> Lags:
+def _lags_of(start: PullerFile, free: bool) -> Lags:
+    """The start's lags; where they are estimated, a short one in place of none."""
     lag, dead, slow = (float(np.mean(getattr(start, name) or 0.0)) for name in LAGS)
-    return Lags(lag or SHORT, dead, slow or SHORT)
+    return Lags(lag or SHORT * free, dead, slow or SHORT * free)
 
 
 class Maximum(NamedTuple):

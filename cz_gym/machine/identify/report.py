@@ -149,12 +149,13 @@ def _numbers(found: Identified) -> bytes:
     """Start and estimates with their 95 % intervals, relative to the start, as PNG."""
     figure = canvas(7.0, 4.5)
     axis = figure.subplots()
-    for y, e in enumerate(found.estimates):
+    shown = [e for e in found.estimates if e.name not in Lags._fields]
+    for y, e in enumerate(shown):
         colour = COLOURS[1] if e.informed else GREY
         axis.plot([max(e.low, 0.0) / e.prior, e.high / e.prior], [y, y], color=colour, lw=2)
         axis.plot(e.value / e.prior, y, "o", color=colour)
     axis.axvline(1.0, color=INK, lw=0.8)
-    axis.set_yticks(range(len(found.estimates)), [OTHERS.get(e.name, (e.name,))[0] for e in found.estimates])
+    axis.set_yticks(range(len(shown)), [OTHERS.get(e.name, (e.name,))[0] for e in shown])
     axis.invert_yaxis()
     axis.set_xlabel("estimate / start [-]; grey: this log says nothing about it")
     return png(figure)

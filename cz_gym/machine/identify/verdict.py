@@ -1,9 +1,7 @@
 """Whether a model fits a log: what its prediction errors, its operating point and its noise say."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -13,9 +11,6 @@ from cz_gym.support.units import KILO, MM
 
 from .grid import Floats
 from .model import Lags
-
-if TYPE_CHECKING:
-    from .estimate import Identified
 
 LAGS, WHITE = 20, 0.01
 """Lags of the whiteness test, and the probability below which residuals count as coloured."""
@@ -29,11 +24,12 @@ NOISY = 2.5
 """Largest ratio of a sensor's noise to what the start file says."""
 
 
-def misfits(found: Identified, puller: Any, away: Mapping[str, float]) -> tuple[str, ...]:
+def misfits(found: Any, puller: Any, away: Mapping[str, float]) -> tuple[str, ...]:
     """Reasons why the model does not fit the log, in words.
 
-    ``puller`` is the estimated one, ``away`` how far each estimate is from its prior's mean, in standard deviations.
-    Only paths that were estimated are judged; a delay or a noise may well be absent.
+    ``found`` is an :class:`.estimate.Identified`, ``puller`` its puller with Q_H_0 and T_1_0, ``away`` how far each
+    estimate is from its prior's mean, in standard deviations. Only paths that were estimated are judged; a delay or a
+    noise may well be absent.
     """
     pull, heater = (share >= 1.0 for share in found.excitation)
     if not (pull or heater):
