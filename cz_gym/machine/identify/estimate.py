@@ -57,7 +57,7 @@ class Estimate(NamedTuple):
     excited: bool = True
     """Whether its drive moved enough; without that it is not estimated."""
     trusted: bool = True
-    """Whether the model fits the log; of a lag, whether there is a delay at all."""
+    """Whether the model fits the log; of a lag, whether they add up to more than half a row."""
 
     @property
     def informed(self) -> bool:
@@ -150,7 +150,7 @@ def identify(
             return Estimate(name, usual, usual, usual, usual, 1.0, excited=False)
         j = model.names.index(name)
         low, value, high = (model.value(name, found.theta[j] + sign * 1.96 * found.sd[j]) for sign in (-1.0, 0.0, 1.0))
-        delay = name not in LAGS or np.subtract(*(_delay(found, model) * (1.0, 2.0))) > 0.0
+        delay = name not in LAGS or np.subtract(*(_delay(found, model) * (1.0, 2.0))) > 0.5 * logs[0].interval
         return Estimate(name, usual, value, low, high, found.sd[j] / sd[j], trusted=bool(delay))
 
     whole = join(rows)

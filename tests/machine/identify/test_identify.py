@@ -40,7 +40,7 @@ def test_derivatives_are_those_of_the_filter(logs):
     theta = model.mean + 0.05
     out, *exact = sensitivities(log, model, theta)
     for j, name in enumerate(model.names):
-        step = 1e-2 if name == "heater_dead_time" else 1e-5  # of seconds, or of a logarithm
+        step = 1e-3 if name in LAGS else 1e-5
         up, down = (predict(log, model, theta + sign * step * np.eye(len(theta))[j]) for sign in (1.0, -1.0))
         for part in (0, 1):
             differences = (up[part] - down[part]).real / (2.0 * step)
