@@ -81,13 +81,14 @@ def _unexplained(drive: Floats, readings: Floats, log: Log) -> Floats:
     whole |= whole.mean() < 0.5
     law = _fit(np.hstack([seen, own]), np.diff(drive)[rows - 1], drive - drive.mean(), whole, keep)
     windows = np.arange(len(rows) // per * per).reshape(-1, per)
-    all_windows, windows = len(windows), windows[whole[windows].all(axis=1)]
+    count, sound = len(windows), windows[whole[windows].all(axis=1)]
+    windows = sound if len(sound) else windows
     first, last = windows[:, 0], rows[windows[:, -1]]
     asked = (seen @ law.weights[: seen.shape[1]] + law.weights[-1])[windows]
     left = drive[last] - drive.mean() - law.run(asked, own[first, :PAST], own[first, PAST:])
     usual = drive[last] - drive[rows[first] - 1]
     left, usual = (np.sort(np.abs(each))[: int((1.0 - FEW) * len(each))] for each in (left, usual))
-    moved: Floats = np.sqrt(all_windows / len(windows)) * left[left > MOVE]  # those left out moved as much
+    moved: Floats = np.sqrt(count / len(windows)) * left[left > MOVE]  # those left out moved as much
     return moved if np.linalg.norm(left) > SHARE * np.linalg.norm(usual) else np.zeros(0)
 
 
