@@ -32,7 +32,8 @@ from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.machine.identify import Excited, Identified, identify, read_log, record_log
-from cz_gym.machine.identify.estimate import PRIOR_SD, measure_excitation
+from cz_gym.machine.identify.estimate import PRIOR_SD
+from cz_gym.machine.identify.moves import measure_excitation
 from cz_gym.machine.puller import PullerFile, read_puller, write_puller
 from cz_gym.support.atomic_files import check_writable, write_files
 from cz_gym.support.command_line import OneLineParser

@@ -5,6 +5,7 @@
 
 from .estimate import Identified, identify
 from .excitation import Excited
-from .log import Log, read_log, record_log
+from .grid import Log
+from .log import read_log, record_log
 
 __all__ = ["Excited", "Identified", "Log", "identify", "read_log", "record_log"]

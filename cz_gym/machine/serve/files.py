@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cz_gym.errors import CzError
-from cz_gym.machine.identify.log import COLUMNS
+from cz_gym.machine.identify.table import COLUMNS
 from cz_gym.support.atomic_files import check_writable, naming, write_files
 
 SYNC = 0.5

@@ -1,0 +1,118 @@
+"""Excitation of a log: the moves of a drive that answer no reading.
+
+A controller's moves are a function of its readings, which a drive's slew rate and range cut off. A linear law is fitted
+to the moves; where a limit cut a move, the law need only ask for as much or more. The law then runs freely over a
+window, on the readings alone, and what the drive has done besides counts: a slow drive that has ramped for a minute has
+moved by a minute's ramp, whatever a row of its log shows.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import lfilter
+
+from cz_gym.machine.puller import DEFAULT, PullerFile
+from cz_gym.support.units import MINUTE
+
+from .grid import Floats, Log
+
+MOVE, ENOUGH = 0.005, (20 * 0.015**2, 20 * 0.005**2)
+"""Unexplained moves count from this share of nominal on; their squares must add up to those of 20 steps of 1.5 % of the
+pull speed, whose path is hidden by the ring's noise, and of 0.5 % of the power."""
+WINDOW = MINUTE
+"""Time over which moves are summed [s]."""
+SHARE = 0.2
+"""Share of a drive's usual move in a window that must be unexplained; less is what the law is not exact for [-]."""
+FEW = 0.1
+"""Share of the windows that do not count: those with the largest moves, which a reading may explain that is lost."""
+PAST, MEANS = 6, (20.0, 60.0, 200.0, 600.0)
+"""Last values of drive and readings that explain a move, and time constants of means that do, too [s]."""
+ROUNDS, EDGE = 30, 0.05
+"""Rounds of the fit, and the share of a limit from which on a move is taken for cut off."""
+
+
+class Law(NamedTuple):
+    """A linear law from what a controller has seen and done to its next move."""
+
+    weights: Floats
+    """Of readings, then of the drive's last values and means, then a constant."""
+    keep: Floats
+    """How much of the drive's means is left after a row [-]."""
+    slew: float
+    lowest: float
+    highest: float
+
+    def room(self, before: Floats) -> tuple[Floats, Floats]:
+        """The least and largest move from where the drive is."""
+        return np.maximum(-self.slew, self.lowest - before), np.minimum(self.slew, self.highest - before)
+
+    def run(self, asked: Floats, past: Floats, means: Floats) -> Floats:
+        """Where the drive is after a window; ``asked``: what the readings ask for, shape (windows, rows)."""
+        own = self.weights[-1 - PAST - len(MEANS) : -1]
+        for each in asked.T:
+            now = past[:, 0] + np.clip(each + np.hstack([past, means]) @ own, *self.room(past[:, 0]))
+            past, means = np.column_stack([now, past[:, :-1]]), self.keep * means + (1.0 - self.keep) * now[:, None]
+        last: Floats = past[:, 0]
+        return last
+
+
+def measure_excitation(log: Log, start: PullerFile = DEFAULT) -> tuple[float, float]:
+    """How much pull speed and heater move on their own, in multiples of what is needed [-]."""
+    errors = np.stack([log.ring - np.nan_to_num(log.r_ref), log.T_1 - np.nan_to_num(log.T_1_ref)], axis=1)
+    pull, heater = log.v_p / start.parameters.v_0, log.Q_H / np.median(log.Q_H)
+    own = (float(np.square(_unexplained(drive, errors, log)).sum()) for drive in (pull, heater))
+    return next(own) / ENOUGH[0], next(own) / ENOUGH[1]
+
+
+def _unexplained(drive: Floats, readings: Floats, log: Log) -> Floats:
+    """Moves in windows that no reading explains, in shares of nominal; none if the law explains nearly all."""
+    at = np.flatnonzero(np.diff(drive)) + 1
+    pace = int(np.median(np.diff(at))) if len(at) > 1 else 1
+    step, readings, drive = pace * log.interval, readings[::pace], drive[::pace]
+    rows, per = np.arange(PAST, len(drive)), max(2, round(WINDOW / step))
+    if len(rows) < 20 * (PAST + len(MEANS)):
+        return np.zeros(0)
+    known = np.where(np.isnan(readings), np.nanmedian(readings, axis=0), readings)
+    keep = np.exp(-step / np.array(MEANS))
+    seen, own = _past(known - known.mean(axis=0), keep, rows), _past(drive[:, None] - drive.mean(), keep, rows)
+    lost = np.isnan(readings).any(axis=1) | np.isin(np.arange(len(drive)), np.flatnonzero(log.gap) // pace)
+    whole = lfilter(np.ones(max(PAST, per)), [1.0], lost)[rows - 1] < 0.5
+    whole |= whole.mean() < 0.5
+    law = _fit(np.hstack([seen, own]), np.diff(drive)[rows - 1], drive - drive.mean(), whole, keep)
+    windows = np.arange(len(rows) // per * per).reshape(-1, per)
+    count, sound = len(windows), windows[whole[windows].all(axis=1)]
+    windows = sound if len(sound) else windows
+    first, last = windows[:, 0], rows[windows[:, -1]]
+    asked = (seen @ law.weights[: seen.shape[1]] + law.weights[-1])[windows]
+    left = drive[last] - drive.mean() - law.run(asked, own[first, :PAST], own[first, PAST:])
+    usual = drive[last] - drive[rows[first] - 1]
+    left, usual = (np.sort(np.abs(each))[: int((1.0 - FEW) * len(each))] for each in (left, usual))
+    moved: Floats = np.sqrt(count / len(windows)) * left[left > MOVE]  # those left out moved as much
+    return moved if np.linalg.norm(left) > SHARE * np.linalg.norm(usual) else np.zeros(0)
+
+
+def _past(values: Floats, keep: Floats, rows: npt.NDArray[np.int64]) -> Floats:
+    """Last values and exponential means before each row, shape (rows, (PAST + MEANS) signals)."""
+    means = [lfilter([1.0 - k], [1.0, -k], values, axis=0, zi=k * values[:1])[0][rows - 1] for k in keep]
+    return np.concatenate([*(values[rows - 1 - lag] for lag in range(PAST)), *means], axis=1)
+
+
+def _fit(X: Floats, moves: Floats, drive: Floats, whole: npt.NDArray[np.bool_], keep: Floats) -> Law:
+    """The law that asks for the moves; a censored regression by successive imputation."""
+    sizes, most, ends = np.maximum(X.std(axis=0), 1e-12), np.abs(moves).max(), (drive.min(), drive.max())
+    slew = most if np.mean(np.abs(moves) > (1.0 - EDGE) * most) > 0.01 else np.inf
+    low, high = (
+        end if np.mean(drive == end) > 0.005 else sign * np.inf for end, sign in zip(ends, (-1.0, 1.0), strict=True)
+    )
+    law = Law(np.zeros(0), keep, float(slew), float(low), float(high))
+    least, largest = law.room(drive[PAST - 1 : -1])
+    over = (np.abs(largest) > EDGE * most) & (moves >= largest - EDGE * most)
+    under = (np.abs(least) > EDGE * most) & (moves <= least + EDGE * most)
+    scaled = np.column_stack([X / sizes, np.ones(len(X))])
+    inverse, asked, weights = np.linalg.pinv(scaled[whole], rcond=1e-10), moves, np.zeros(0)
+    for _ in range(ROUNDS if (over | under).any() else 1):
+        weights = inverse @ asked[whole]
+        wanted = scaled @ weights
+        asked = np.where(over, np.maximum(wanted, moves), np.where(under, np.minimum(wanted, moves), moves))
+    return law._replace(weights=weights / np.append(sizes, 1.0))
