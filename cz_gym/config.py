@@ -165,10 +165,10 @@ def make_config(
     camera: Camera | None = None,
     action: str = "smooth",
     puller: str | Path | PullerFile | None = None,
-    process: Process = BODY,
+    process: Process | None = None,
 ) -> Config:
     """Check the arguments of the environment; CzError names what was given and what is allowed."""
-    machine = find_puller(puller)
+    machine, process = find_puller(puller), process or BODY
     if puller is not None and parameters is not None:
         raise CzError(f"parameters are those of the puller {machine.name!r}: give one of both")
     drawn_from = adapt_scenario(machine, find_distribution(scenario))

@@ -175,7 +175,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         action: str = "smooth",
         info: str = "lean",
         puller: str | Path | PullerFile | None = None,
-        process: Process = BODY,
+        process: Process | None = None,
         **others: Any,
     ) -> None:
         known_keywords(others, type(self).__init__)

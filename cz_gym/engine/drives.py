@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.jit.compile import jittable, labelled, set_labelled
+from cz_gym.jit.compile import force_inlined, jittable, labelled, set_labelled
 from cz_gym.process import Inputs
 
 from .arithmetic import clip
@@ -55,7 +55,7 @@ def drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any, process: 
     set_labelled(process.Extra, extra, slot)
 
 
-@jittable
+@force_inlined
 def is_slow(e: Any) -> Any:
     """Whether the power that heats is not simply the one that was set."""
     return e.heater_lag > 0.0 or e.heater_dead_time > 0.0

@@ -47,8 +47,6 @@ def _freezes(slot: Any, t: Any) -> Any:
 def _filtered(slot: Any, T_1: Any, t: Any) -> Any:
     """The true temperature [K] through the pyrometer's filter: exact for one that moves straight between samples."""
     tau = slot.episode.pyrometer_filter
-    if tau <= 0.0:
-        return T_1
     if slot.k == 0:
         slot.T_filtered = T_1
     else:
@@ -67,7 +65,8 @@ def sense(slot: Any, camera: Any, pyrometer: Any, frames: Any, t: Any, seen: Any
     shows the last reading again.
     """
     e = slot.episode
-    slot.T_1 = _filtered(slot, seen.T_1, t) + pyrometer_drift(t, e) + pyrometer
+    T_1 = _filtered(slot, seen.T_1, t) if e.pyrometer_filter > 0.0 else seen.T_1
+    slot.T_1 = T_1 + pyrometer_drift(t, e) + pyrometer
     lost = np.isnan(camera)
     frozen, flagged = _freezes(slot, t)
     slot.valid = 0.0 if lost or flagged else 1.0
