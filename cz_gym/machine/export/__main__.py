@@ -19,7 +19,8 @@ from cz_gym.support.units import KILO, MM_PER_MIN
 
 from .agent import Agent
 from .onnx_graph import write_onnx
-from .shell import Alarm, Block
+from .ports import Alarm
+from .shell import Block
 from .text import fill_template, meanings, write_c, write_st
 
 REGISTRY, AGENTS = "cz_gym.baselines.registry", "cz_gym.agents"

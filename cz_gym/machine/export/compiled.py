@@ -14,7 +14,8 @@ import numpy as np
 
 from cz_gym.errors import CzError
 
-from .shell import INPUTS, Block
+from .ports import INPUTS
+from .shell import Block
 from .text import write_c
 from .trace import Floats
 

@@ -20,7 +20,7 @@ from cz_gym.machine.puller import PullerFile, write_puller
 from cz_gym.observation import Measured, decode
 
 from .program import Port
-from .shell import INPUTS, OUTPUTS, in_plant_units, in_shares, nominal_puller
+from .ports import INPUTS, OUTPUTS, in_plant_units, in_shares, nominal_puller
 
 SCRIPT = """import ctypes
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from .ports import Alarm
 from .program import Port, Program
-from .shell import Alarm
 from .writer import Writer, runs
 
 TEMPLATES = Path(__file__).parent / "templates"

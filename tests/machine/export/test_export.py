@@ -18,7 +18,7 @@ from cz_gym.machine.export.__main__ import main, make_block
 from cz_gym.machine.export.compiled import CompiledBlock
 from cz_gym.machine.export.onnx_graph import write_onnx
 from cz_gym.machine.export.policy import BlockPolicy
-from cz_gym.machine.export.shell import INPUTS, Alarm, in_shares
+from cz_gym.machine.export.ports import INPUTS, Alarm, in_shares
 from cz_gym.machine.export.text import write_c, write_st
 from cz_gym.observation import decode, readable
 from cz_gym.vector import CzVectorEnv

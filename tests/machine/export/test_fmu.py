@@ -6,7 +6,7 @@ import pytest
 from cz_gym import CzEnv
 from cz_gym.machine.export.__main__ import main
 from cz_gym.machine.export.fmu import SHOWN
-from cz_gym.machine.export.shell import OUTPUTS, in_plant_units, in_shares, nominal_puller
+from cz_gym.machine.export.ports import OUTPUTS, in_plant_units, in_shares, nominal_puller
 from cz_gym.observation import decode
 
 
