@@ -18,6 +18,7 @@ from .ports import INPUTS
 from .shell import Block
 from .text import write_c
 from .trace import Floats
+from .writer import Writer
 
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
 """Options of the compiler."""
@@ -42,11 +43,14 @@ class CompiledBlock:
         self._init.argtypes, self._step.argtypes = [ctypes.c_void_p], [ctypes.c_void_p] * 3
         real = "f4" if single else "f8"
         self.settings = {port.name for port in program.settings}
-        cells = [(cell.name, "f8" if cell.wide else real, cell.start.shape) for cell in program.memory]
-        self.memory = np.dtype([*((port.name, "f8") for port in program.settings), *cells], align=True)
+        writer, kinds = Writer(program, "c", single), {"b": "u1", "d": "f8", "w": real}
+        arrays = [(name, kinds[kind], size) for name, (size, kind) in writer.work.items() if size > 1]
+        room: Any = ("work", np.dtype([("unused", "u1"), *arrays], align=True))
+        cells: Any = [(cell.name, "f8" if cell.wide else real, cell.start.shape) for cell in program.memory]
+        self.memory = np.dtype([*((port.name, "f8") for port in program.settings), *cells, room], align=True)
         self.measured = np.dtype([(port.name, "i4" if port.logical else "f8") for port in INPUTS], align=True)
-        kinds = [(port.name, "u4" if port.name == "alarms" else real) for port, _ in program.outputs]
-        self.setpoints = np.dtype(kinds, align=True)
+        shown = [(port.name, "u4" if port.name == "alarms" else real) for port, _ in program.outputs]
+        self.setpoints = np.dtype(shown, align=True)
 
     def start(self, n: int) -> Any:
         """The memory of n blocks before their first sample, a structured array of shape (n,)."""

@@ -19,8 +19,8 @@ from cz_gym.env import CzEnv
 from cz_gym.machine.puller import PullerFile, write_puller
 from cz_gym.observation import Measured, decode
 
-from .program import Port
 from .ports import INPUTS, OUTPUTS, in_plant_units, in_shares, nominal_puller
+from .program import Port
 
 SCRIPT = """import ctypes
 

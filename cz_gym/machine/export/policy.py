@@ -58,9 +58,7 @@ class BlockPolicy:
     def made_for(self) -> MadeFor:
         """The environment that takes its actions."""
         made_for = self.block.config.made_for
-        return made_for._replace(
-            action=self.action, control_interval=self.interval or made_for.control_interval
-        )
+        return made_for._replace(action=self.action, control_interval=self.interval or made_for.control_interval)
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True

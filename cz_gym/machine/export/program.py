@@ -13,6 +13,8 @@ from .trace import BAD, Floats, Graph, Ids, Node
 
 WIDE = ("clock_s", "called_s")
 """Memory that needs double precision also where the controller computes in single precision, beside sums over time."""
+PASSES = 3
+"""Most samples of one call."""
 CARRY = ("add", "subtract", "negative", "minimum", "maximum", "select", "multiply", "divide")
 """Operations through which a sum over time goes on, products and quotients with a constant."""
 

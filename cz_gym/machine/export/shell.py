@@ -28,7 +28,7 @@ from cz_gym.physics.linearisation import STATES, linearise
 from cz_gym.support.units import KILO, MINUTE, MM_PER_MIN
 
 from .ports import INPUTS, OUTPUTS, Alarm, nominal_puller, readings_of, settings_of
-from .program import Port, Program, record
+from .program import PASSES, Port, Program, record
 from .trace import FINITE, Floats
 
 JUMP, MEND = 8.0, 0.05 / MINUTE
@@ -42,8 +42,6 @@ ASTRAY, FAR = MINUTE, 0.05
 LEVEL, TRIM_T_1, TRIM_Q_H = 10.0 * MINUTE, 1.5, 0.02
 """Averaging time of the pull speed [s]; what a takeover leaves of the deviation from the nominal temperature [K] and
 power [share of the heater's range]. The rest counts as an error of the nominal values."""
-PASSES = 3
-"""Most samples of one call."""
 SLOWER = 3.0
 """Time constant of the mean pull speed under that trim, in multiples of its averaging time [-]."""
 TEMPERATURES = "T_1", "T_2", "T_b"
