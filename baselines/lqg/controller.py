@@ -52,6 +52,10 @@ class LQGDesign:
     is lost (nested saturation, Teel 1992)."""
 
 
+PUZZLING = 0.55
+"""Mean of the innovations over ten minutes, in standard deviations, that no good model has [-]."""
+
+
 class Gains(NamedTuple):
     """Filter and regulator of one puller, or of one puller a slot."""
 
@@ -132,6 +136,10 @@ class LQG(MeasuredController):
         previous = applied + np.where(starts[:, None], 0.0, np.clip(memory.command - applied, -slack, slack))
         inputs = self.law(state.mean, plan, previous)
         return inputs[:, 0], inputs[:, 1], Memory(state, plan, inputs, np.ones(len(inputs)))
+
+    def puzzled(self, memory: Memory) -> Any:
+        """Whether its model does not explain the readings: the innovations have a mean that noise has not."""
+        return (np.abs(memory.filter.surprise) > PUZZLING).any(axis=-1)
 
     def law(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
         """The regulator's inputs [m/s, W], deviations within the drives' range, shape (n, 2).

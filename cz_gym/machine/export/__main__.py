@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import pkgutil
 import re
+import unicodedata
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from cz_gym.config import Config, make_config
 from cz_gym.errors import CzError
+from cz_gym.machine.puller import DEFAULT
 from cz_gym.observation import CLIP
 from cz_gym.support.atomic_files import write_files
 from cz_gym.support.command_line import OneLineParser, shown
@@ -23,10 +25,11 @@ from .ports import Alarm
 from .shell import Block
 from .text import fill_template, meanings, write_c, write_st
 
-REGISTRY, AGENTS = "cz_gym.baselines.registry", "cz_gym.agents"
-"""Modules that know controllers and agents, looked up by name because this package imports neither."""
-FALLBACK = "paper-tuned"
-"""The PID that takes over."""
+REGISTRY, AGENTS, SEARCH = "cz_gym.baselines.registry", "cz_gym.agents", "cz_gym.baselines.fallback:fallback"
+"""Modules that know controllers and agents, and the search for the PID that takes over, looked up by name because this
+package imports neither."""
+FALLBACK = "fallback"
+"""Name of the PID that takes over, as a controller of its own."""
 WRITERS: dict[str, Any] = {"c": write_c, "st": write_st, "onnx": write_onnx}
 
 
@@ -42,8 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--to", choices=("c", "fmu", "onnx", "st"), required=True, help="C99, FMI, ONNX, IEC 61131-3 structured text")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
     parser.add_puller("its nominal values, its drives' limits, what is designed for it")
-    add("--scenario", default="puller", metavar="NAME",
-        help="scenario whose tuned settings a controller has, and that a plant begins with (%(default)s)")  # fmt: skip
+    add("--scenario", metavar="NAME",
+        help="scenario whose tuned settings a controller has, or that a plant begins with (puller)")  # fmt: skip
     add("--real", choices=("double", "float"), default="double", help="precision of c and st (%(default)s)")
     return parser.run(_export, arguments, "plant")
 
@@ -51,11 +54,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _export(given: argparse.Namespace) -> None:
     if given.plant != (given.to == "fmu") or given.plant == bool(given.controller):
         raise CzError("name a controller and --to c, st or onnx; or --plant --to fmu")
-    config = make_config(given.scenario, observation="measured", action="direct", puller=given.puller)
+    if given.scenario and given.puller and not given.plant:
+        raise CzError(
+            "--scenario is for the default puller: a puller file has settings of its own, whatever the scenario"
+        )
+    config = make_config(given.scenario or "puller", observation="measured", action="direct", puller=given.puller)
     if given.plant:
         from .fmu import build_fmu
 
-        print(shown(build_fmu(given.out, given.scenario, config.puller if given.puller else None)))
+        print(shown(build_fmu(given.out, config.scenario.name, config.puller if given.puller else None)))
         return
     block = make_block(given.controller, config)
     files = WRITERS[given.to](block.program, given.real == "float")
@@ -72,17 +79,28 @@ def make_block(name: str, config: Config) -> Block:
     agents: Any = pkgutil.resolve_name(AGENTS)
     known = [entry.name for entry in pkgutil.resolve_name(f"{REGISTRY}:CONTROLLERS") if not entry.bound]
     plant = f"Puller {config.puller.label}; plant {config.plant_hash}; control interval {config.control_interval:g} s."
-    pid = pkgutil.resolve_name(f"{REGISTRY}:make_controller")(FALLBACK, config)
-    identifier = re.sub(r"\W+", "_", Path(name.removesuffix(".onnx")).name.lower())
+    pid, *margins = pkgutil.resolve_name(SEARCH)(config)
+    found = (
+        f"Fallback: PID searched for this puller with the drives and the camera of scenario {config.scenario.name}: "
+        "gain margin {:.3g}, phase margin {:.3g} deg on Models I and II with a latency of {:g} s.".format(*margins)
+    )
+    identifier = identifier_of(Path(name.removesuffix(".onnx")).name)
+    if name == FALLBACK:
+        return Block(identifier, pid, pid, config, (found, plant))
     if name in known:
         entry = pkgutil.resolve_name(f"{REGISTRY}:find_controller")(name)
-        tuned = f"Settings tuned for scenario {config.scenario.name} ({config.scenario.hash}). {plant}"
+        tuned = f"Settings of scenario {config.scenario.name} ({config.scenario.hash})"
+        tuned = (
+            tuned if config.puller == DEFAULT else "Settings scaled to the puller, or searched for it beside its file"
+        )
         controller = entry.make(config)
         if not (hasattr(controller, "at_rest") and hasattr(controller, "step")):
             raise CzError(f"{name} cannot be exported: it solves an optimisation problem, or has no feedback")
-        return Block(identifier, controller, pid, config, (f"Controller {name}: {entry.meaning}.", tuned))
+        return Block(
+            identifier, controller, pid, config, (f"Controller {name}: {entry.meaning}.", f"{tuned}. {plant}", found)
+        )
     if name not in agents.shipped_names() and Path(name).suffix != ".onnx":
-        raise CzError(unknown("controller or agent", name, [*known, *agents.shipped_names()]))
+        raise CzError(unknown("controller or agent", name, [*known, FALLBACK, *agents.shipped_names()]))
     contract = (policy := agents.load(name)).contract
     its, own = (
         f"puller {each.puller}, plant {each.plant}, control interval {each.control_interval:g} s"
@@ -94,8 +112,15 @@ def make_block(name: str, config: Config) -> Block:
         f"Agent {name}: {contract.algorithm}, seed {contract.training_seed}, trained on {contract.scenario} "
         f"({contract.scenario_hash}).",
         f"File {contract.sha256}; observation {contract.observation} {contract.observation_hash}. {plant}",
+        found,
     )
     return Block(identifier, Agent(policy, config), pid, config, facts)
+
+
+def identifier_of(name: str) -> str:
+    """A name as a part of identifiers: a letter or digit at both ends, no two underscores in a row, ASCII."""
+    plain = unicodedata.normalize("NFKD", name.lower()).encode("ascii", "ignore").decode()
+    return re.sub(r"[^a-z0-9]+", "_", plain).strip("_") or "agent"
 
 
 def readme(block: Block, files: list[str]) -> str:
