@@ -12,6 +12,7 @@ from typing import Any
 
 from cz_gym.config import Config, make_config
 from cz_gym.errors import CzError
+from cz_gym.machine.identify.log import read_log
 from cz_gym.machine.puller import DEFAULT
 from cz_gym.observation import CLIP
 from cz_gym.support.atomic_files import write_files
@@ -20,10 +21,12 @@ from cz_gym.support.names import unknown
 from cz_gym.support.units import KILO, MM_PER_MIN
 
 from .agent import Agent
+from .compiled import memory_of
 from .onnx_graph import write_onnx
-from .ports import Alarm
+from .ports import Alarm, meanings
 from .shell import Block
-from .text import fill_template, meanings, write_c, write_st
+from .text import fill_template, write_c, write_st
+from .vector import shadow, test_vector
 
 REGISTRY, AGENTS, SEARCH = "cz_gym.baselines.registry", "cz_gym.agents", "cz_gym.baselines.fallback:fallback"
 """Modules that know controllers and agents, and the search for the PID that takes over, looked up by name because this
@@ -42,7 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("controller", nargs="?", help="a classical controller, a shipped agent, or an agent file (.onnx)")
     add("--plant", action="store_true", help="the puller in place of a controller (--to fmu)")
-    add("--to", choices=("c", "fmu", "onnx", "st"), required=True, help="C99, FMI, ONNX, IEC 61131-3 structured text")
+    add("--to", choices=("c", "fmu", "onnx", "st"), help="C99, FMI, ONNX, IEC 61131-3 structured text")
+    add("--shadow", type=Path, metavar="LOG", help="in place of --to: run the controller beside a log, and report")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
     parser.add_puller("its nominal values, its drives' limits, what is designed for it")
     add("--scenario", metavar="NAME",
@@ -52,8 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _export(given: argparse.Namespace) -> None:
-    if given.plant != (given.to == "fmu") or given.plant == bool(given.controller):
-        raise CzError("name a controller and --to c, st or onnx; or --plant --to fmu")
+    fmu, asked = given.to == "fmu", bool(given.to) != bool(given.shadow)
+    if not asked or given.plant != fmu or given.plant == bool(given.controller):
+        raise CzError("name a controller and --to c, st or onnx, or --shadow LOG; or --plant --to fmu")
     if given.scenario and given.puller and not given.plant:
         raise CzError(
             "--scenario is for the default puller: a puller file has settings of its own, whatever the scenario"
@@ -65,14 +70,17 @@ def _export(given: argparse.Namespace) -> None:
         print(shown(build_fmu(given.out, config.scenario.name, config.puller if given.puller else None)))
         return
     block = make_block(given.controller, config)
-    files = WRITERS[given.to](block.program, given.real == "float")
-    files["README.md"] = readme(block, list(files))
+    if given.shadow:
+        files = shadow(block, read_log(given.shadow))
+    else:
+        files = WRITERS[given.to](block.program, given.real == "float") | {"vector.csv": test_vector(block)}
+        files["README.md"] = readme(block, list(files), given.real == "float")
     write_files({given.out / name: text.encode() if isinstance(text, str) else text for name, text in files.items()})
     print(*(shown(given.out / name) for name in files), sep="\n")
 
 
 def make_block(name: str, config: Config) -> Block:
-    """A controller or agent in its shell; its fallback is the re-tuned PID of the same settings.
+    """A controller or agent in its shell; its fallback is a PID searched for the puller.
 
     CzError if there is none of that name, if it cannot be exported, or if an agent is of another puller.
     """
@@ -123,16 +131,20 @@ def identifier_of(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", plain).strip("_") or "agent"
 
 
-def readme(block: Block, files: list[str]) -> str:
+def readme(block: Block, files: list[str], single: bool = False) -> str:
     """The README beside the files."""
+    memory, stack = memory_of(block.program, single)
     kinds = {
         ".h": "declarations", ".c": "the block", ".st": "the function block",
+        ".csv": "a test vector: inputs and outputs of calls one after the other, with the default settings, for a port",
         ".onnx": "the block as a graph in double precision, inputs of shape [1]; the output `next_memory` is the input "
         "`memory` of the next call, which the first call leaves out",
     }  # fmt: skip
     program, config = block.program, block.config
     parts = {
         "files": "\n".join(f"| `{name}` | {kinds[Path(name).suffix]} |" for name in files),
+        "memory": f"{memory.itemsize / 1024:.0f}",
+        "stack": f"{stack / 1024:.0f}",
         "interval": f"{config.control_interval:g}",
         "pull": f"{CLIP * config.parameters.v_0 / MM_PER_MIN:g}",
         "heater": f"{CLIP * config.heater_range / KILO:g}",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import math
+import re
 from collections.abc import Mapping
 from enum import IntFlag
 from functools import cache
@@ -56,6 +58,12 @@ class Alarm(IntFlag):
     """A drive has not followed its setpoint for a minute; its setpoint stays near it."""
     MODEL = 16384
     """The controller's model does not explain the readings: the PID takes over."""
+
+
+def meanings(kind: Any) -> dict[Any, str]:
+    """The members of an enumeration with the docstrings below them."""
+    found = re.findall(r'^    (\w+) = \d+\n    """(.*?)"""', inspect.getsource(kind), re.MULTILINE | re.DOTALL)
+    return {kind[name]: " ".join(text.split()) for name, text in found}
 
 
 INPUTS = (

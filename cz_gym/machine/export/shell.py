@@ -42,6 +42,8 @@ ASTRAY, FAR = MINUTE, 0.05
 LEVEL, TRIM_T_1, TRIM_Q_H = 10.0 * MINUTE, 1.5, 0.02
 """Averaging time of the pull speed [s]; what a takeover leaves of the deviation from the nominal temperature [K] and
 power [share of the heater's range]. The rest counts as an error of the nominal values."""
+SETTLED = 15.0 * MINUTE
+"""Time after a takeover from which readings that a controller's model does not explain count [s]."""
 SLOWER = 3.0
 """Time constant of the mean pull speed under that trim, in multiples of its averaging time [-]."""
 TEMPERATURES = "T_1", "T_2", "T_b"
@@ -229,7 +231,8 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
     good = seen.ring & seen.reference & seen.pyrometer & known
     bad = np.where(good, 0.0, np.where(call.starts, 0.0, memory.bad) + dt)
     dark = np.where(seen.pyrometer, 0.0, np.where(call.starts, 0.0, memory.dark) + dt)
-    puzzled = runs & (controller.puzzled(memory.controller) if hasattr(controller, "puzzled") else False)
+    settled = runs & (memory.since > SETTLED)
+    puzzled = settled & (controller.puzzled(memory.controller) if hasattr(controller, "puzzled") else False)
     fallen = runs & (memory.fallback > 0.5)
     fallback = runs & (fallen | (bad > given["fallback_after_s"]) | puzzled)
     since = np.where(runs & (fallen | ~fallback), memory.since + dt, 0.0)

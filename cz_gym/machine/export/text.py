@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from textwrap import indent, wrap
-from typing import Any
 
 import numpy as np
 
-from .ports import Alarm
+from .ports import Alarm, meanings
 from .program import PASSES, Port, Program
 from .writer import Writer, runs
 
@@ -89,9 +87,3 @@ def harmless(text: str) -> str:
     """A text that may stand in a comment of any language: plain ASCII without ends or beginnings of comments."""
     plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
     return re.sub(r"[*\\?{}$]+", "", plain)
-
-
-def meanings(kind: Any) -> dict[Any, str]:
-    """The members of an enumeration with the docstrings below them."""
-    found = re.findall(r'^    (\w+) = \d+\n    """(.*?)"""', inspect.getsource(kind), re.MULTILINE | re.DOTALL)
-    return {kind[name]: " ".join(text.split()) for name, text in found}
