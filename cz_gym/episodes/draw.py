@@ -125,8 +125,10 @@ def draw_episode(record: Any, streams: Any, freezes: Any) -> Any:
     sd_fast, sd_slow = between(record.interface.sd, at[0]), between(record.interface.sd, at[1])
     keep_fast, keep_slow = np.exp(-GRID / record.interface.tau_fast), np.exp(-GRID / record.interface.tau_slow)
     fault = _draw_faults(record.faults, streams[_FAULTS], freezes)
+    r_c_start = record.pullers.start_radius_sd * normal(streams[_START])
+    slow = _uniforms(streams[_START], 3)
     return Episode(
-        r_c_start=record.pullers.start_radius_sd * normal(streams[_START]),
+        r_c_start=r_c_start,
         recipe_start=between(recipe.start, plan[2]),
         recipe_duration=max(recipe_length, SHORTEST),
         recipe_amount=between(recipe.rate, plan[0]) * recipe_length,
@@ -162,6 +164,9 @@ def draw_episode(record: Any, streams: Any, freezes: Any) -> Any:
         dropout=fault[3],
         outlier_probability=sensor.outlier_probability,
         outlier_sd=sensor.outlier_sd,
+        heater_lag=between(drives.heater_lag, slow[0]),
+        heater_dead_time=between(drives.heater_dead_time, slow[1]),
+        pyrometer_filter=between(sensor.pyrometer_filter, slow[2]),
     )
 
 

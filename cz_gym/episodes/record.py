@@ -123,6 +123,12 @@ class Episode(NamedTuple):
     """Probability that a sample carries an outlier [-]."""
     outlier_sd: float = 0.0
     """Standard deviation of an outlier [m]."""
+    heater_lag: float = 0.0
+    """Time constant with which the power that heats follows the heater's setpoint [s]."""
+    heater_dead_time: float = 0.0
+    """Time before the power that heats begins to follow the setpoint [s]."""
+    pyrometer_filter: float = 0.0
+    """Time constant of the pyrometer's filter [s]."""
 
 
 class Factors(NamedTuple):

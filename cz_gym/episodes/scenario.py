@@ -42,6 +42,10 @@ MAX_NOISE = 2.0 * MM
 """Largest standard deviation of the camera's noise [m]."""
 MAX_LATENCY = 60.0
 """Oldest camera frame a scenario may deliver [s]."""
+MAX_LAG = 300.0
+"""Largest time constant of the heater and of the pyrometer's filter [s]."""
+MAX_DEAD_TIME = 60.0
+"""Longest dead time of the heater [s]."""
 MAX_FLAGGED, MAX_UNFLAGGED = 3, 1
 """Most freezes of each kind in an episode."""
 _LONGEST = 1e6
@@ -190,6 +194,8 @@ class Sensor:
     """Share of samples that carry an outlier [-]."""
     outlier_sd: float = member(0.0, Draw.NEVER, 0.0, MAX_LENGTH, IN_MM)
     """Standard deviation of an outlier [m]."""
+    pyrometer_filter: Range = member(NONE, Draw.RANGE, 0.0, MAX_LAG, later=True)
+    """Time constant of the pyrometer's filter, a first-order lag of T_1 as it is read [s]."""
 
 
 @dataclass(frozen=True)
@@ -224,6 +230,10 @@ class Actuators:
     """Largest rate of change of Q_H [W/s]."""
     heater_step: float = member(0.0, Draw.NEVER, 0.0, 1e5)
     """Resolution of Q_H - Q_H0 [W]."""
+    heater_lag: Range = member(NONE, Draw.RANGE, 0.0, MAX_LAG, later=True)
+    """Time constant with which the power that heats follows the heater's setpoint, a first-order lag [s]."""
+    heater_dead_time: Range = member(NONE, Draw.RANGE, 0.0, MAX_DEAD_TIME, later=True)
+    """Time before the power that heats begins to follow the setpoint [s]."""
 
 
 @dataclass(frozen=True)

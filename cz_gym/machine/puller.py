@@ -24,7 +24,7 @@ import numpy as np
 from cz_gym.body.plant import make_puller
 from cz_gym.body.task import HEATER_RANGE, RADIUS_LIMIT, check_height
 from cz_gym.episodes.mixture import Distribution, Mixture
-from cz_gym.episodes.scenario import MAX_LATENCY, Range, Scenario
+from cz_gym.episodes.scenario import MAX_DEAD_TIME, MAX_LAG, MAX_LATENCY, Range, Scenario
 from cz_gym.errors import CzError
 from cz_gym.physics.parameters import Parameters, check_parameters
 from cz_gym.support.atomic_files import naming, write_files
@@ -81,6 +81,8 @@ class Key(NamedTuple):
     """Its name in :class:`PullerFile`, or in Parameters."""
     drawn: bool = False
     """Whether each crystal draws its own number from a range."""
+    later: bool = False
+    """Whether it was added after hashes were published; None is then left out of the hash."""
 
     @property
     def name(self) -> str:
@@ -94,10 +96,17 @@ class Key(NamedTuple):
 
 
 def number(
-    table: str, unit: str, low: float, high: float, default: Any = None, drawn: bool = False, stem: str = ""
+    table: str,
+    unit: str,
+    low: float,
+    high: float,
+    default: Any = None,
+    drawn: bool = False,
+    stem: str = "",
+    later: bool = False,
 ) -> Any:
     """A number of a puller, with its :class:`Key` in the file, whose stem is the field's name unless one is given."""
-    return field(default=default, metadata={"key": Key(table, stem, unit, low, high, "", drawn)})
+    return field(default=default, metadata={"key": Key(table, stem, unit, low, high, "", drawn, later)})
 
 
 @dataclass(frozen=True)
@@ -119,6 +128,10 @@ class PullerFile:
     """Largest rate of change of the heater power [W/s]"""
     heater_step: float | None = number("drives", "W", 0.0, 1e4)
     """Resolution of the heater power [W]"""
+    heater_lag: Range | None = number("drives", "s", 0.0, MAX_LAG, drawn=True, later=True)
+    """Time constant with which the power that heats follows the setpoint [s]"""
+    heater_dead_time: Range | None = number("drives", "s", 0.0, MAX_DEAD_TIME, drawn=True, later=True)
+    """Time before the power that heats begins to follow the setpoint [s]"""
     pull_max: float | None = number("drives", "mm_per_min", 0.01, 60.0)
     """Largest pull speed; narrows its window [m/s]"""
     pull_window: float | None = number("drives", "mm_per_min", 0.001, 60.0)
@@ -147,6 +160,8 @@ class PullerFile:
     """Share of samples that carry an outlier [-]"""
     outlier_sd: float | None = number("sensors", "mm", 0.0, 5.0)
     """Standard deviation of an outlier [m]"""
+    pyrometer_filter: Range | None = number("sensors", "s", 0.0, MAX_LAG, drawn=True, later=True)
+    """Time constant of the pyrometer's filter [s]"""
     fluctuation_sd: Range | None = number("melt", "K", 0.0, 100.0, drawn=True)
     """Standard deviation of the fast and of the slow fluctuation of the melt, each drawn on its own [K]"""
     tau_fast: float | None = number("melt", "s", 0.1, 1e5)
@@ -181,9 +196,12 @@ class PullerFile:
     @cached_property
     def hash(self) -> str:
         """SHA-256 of everything but the name (16 hex digits)."""
-        numbers = [value_of(self, key) for key in KEYS]
-        plain = [value if value is None else (np.asarray(value, float) + 0.0).tolist() for value in numbers]
-        return hashlib.sha256(json.dumps([FORMAT, plain]).encode()).hexdigest()[:16]
+        plain = {key: None if (value := value_of(self, key)) is None else (np.asarray(value, float) + 0.0).tolist()
+                 for key in KEYS}  # fmt: skip
+        contents: list[Any] = [FORMAT, [value for key, value in plain.items() if not key.later]]
+        if later := {key.name: value for key, value in plain.items() if key.later and value is not None}:
+            contents.append(later)
+        return hashlib.sha256(json.dumps(contents).encode()).hexdigest()[:16]
 
     @property
     def label(self) -> str:
@@ -426,7 +444,9 @@ def on(puller: PullerFile, distribution: Distribution) -> Distribution:
     for family in fields(Scenario)[1:]:
         old, values = getattr(distribution, family.name), {}
         for each in fields(old):
-            size = power if each.name.startswith("heater_") else sizes.get(each.metadata["member"].slip, 1.0)
+            size = (
+                power if each.name in ("heater_slew", "heater_step") else sizes.get(each.metadata["member"].slip, 1.0)
+            )
             size = speed if family.name == "reference" and each.name == "amount" else size
             stated, own = said.get(each.name), getattr(old, each.name)
             scaled = own if size == 1.0 else tuple(size * end for end in own) if isinstance(own, tuple) else size * own

@@ -11,7 +11,7 @@ from scipy import stats
 from cz_gym import SCENARIOS, Parameters, Scenario, make_puller
 from cz_gym.episodes.draw import randomised
 from cz_gym.episodes.record import FREEZES, Episode, Factors
-from cz_gym.episodes.scenario import Draw, Faults, Interface, Recipe, Reference, Sensor
+from cz_gym.episodes.scenario import Actuators, Draw, Faults, Interface, Recipe, Reference, Sensor
 from cz_gym.episodes.series import draw_episode, draw_factors, new_series
 
 MM, MINUTE, SPAN = 1e-3, 60.0, 10800.0
@@ -182,6 +182,23 @@ def test_hot_zone_draws_are_log_uniform_on_the_crystals_of_randomized():
     low = np.log([0.75] * 4 + [0.5, 0.5, 0.7])
     high = np.log([1.33] * 4 + [2.0, 2.0, 1.4])
     check_uniform((np.log(hot_zone[:, 3:]) - low) / (high - low))
+
+
+def test_lags_of_heater_and_pyrometer_are_drawn_on_the_same_crystals():
+    slow = dataclasses.replace(
+        SCENARIOS["hot-zone"],
+        name="slow",
+        actuators=Actuators(heater_lag=(0.0, 10.0), heater_dead_time=(2.0, 5.0)),
+        sensor=dataclasses.replace(SCENARIOS["hot-zone"].sensor, pyrometer_filter=(0.0, 20.0)),
+    )
+    draws = [draw(slow, key) for key in keys(1000)]
+    check_uniform(
+        np.array([[e.heater_lag / 10, (e.heater_dead_time - 2) / 3, e.pyrometer_filter / 20] for e, _ in draws])
+    )
+    for key, (e, series) in zip(keys(5), draws, strict=False):
+        plain, same_series = draw("hot-zone", key)
+        assert e._replace(heater_lag=0.0, heater_dead_time=0.0, pyrometer_filter=0.0) == plain
+        assert all(np.array_equal(a, b) for a, b in zip(series, same_series, strict=True))
 
 
 def check_uniform(columns):

@@ -39,13 +39,16 @@ BLIND = MINUTE
 """Time for which a controller that estimates the temperature keeps the heater without a pyrometer [s]."""
 ASTRAY, FAR = MINUTE, 0.05
 """Time after which a drive counts as not following [s], and its distance from the setpoint in shares of its range."""
-LEVEL, TRIM_T_1, TRIM_Q_H = 10.0 * MINUTE, 1.5, 0.02
+import os
+VARIANT = os.environ.get("VARIANT", "B")
+LEVEL, TRIM_T_1, TRIM_Q_H = 5.0 * MINUTE, 1.5, 0.02
 """Averaging time of the pull speed [s]; what a takeover leaves of the deviation from the nominal temperature [K] and
 power [share of the heater's range]. The rest counts as an error of the nominal values."""
 SETTLED = 15.0 * MINUTE
 """Time after a takeover from which readings that a controller's model does not explain count [s]."""
-SLOWER = 3.0
-"""Time constant of the mean pull speed under that trim, in multiples of its averaging time [-]."""
+SLOWER, FOLLOWED = 1.5, 0.5
+"""Of the heater without a pyrometer: the time constant of the mean pull speed, in multiples of its averaging time; the
+share of the recipe's movement that is followed [-]."""
 TEMPERATURES = "T_1", "T_2", "T_b"
 UNKNOWN = "clock_s", "called_s", "pull", "heater", "shown"
 """Memory that is infinite before the first sample."""
@@ -228,7 +231,7 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
     runs = engaged & before
     away = runs & (drives[0].away | drives[1].away)
     astray = np.where(call.later, memory.astray, np.where(away, memory.astray + dt, 0.0))
-    good = seen.ring & seen.reference & seen.pyrometer & known
+    good = seen.ring & seen.reference & known
     bad = np.where(good, 0.0, np.where(call.starts, 0.0, memory.bad) + dt)
     dark = np.where(seen.pyrometer, 0.0, np.where(call.starts, 0.0, memory.dark) + dt)
     settled = runs & (memory.since > SETTLED)
@@ -267,8 +270,10 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
     level = np.where(call.starts, 0.0, memory.level)
     level = level + min(dt / LEVEL, 1.0) * (seen.read.v_p / (drives[0].nominal * MM_PER_MIN) - level)
     blind = ~seen.pyrometer & ((dark > BLIND) | fallback | (not estimates))
+    if VARIANT == "A" and estimates:
+        blind = blind & fallback
     moved = np.where(seen.reference & ~call.starts, seen.read.T_1_ref - memory.readings.T_1_ref, 0.0)
-    trim = facts.feed * moved + facts.trim * (level - memory.level + dt / facts.slow * level)
+    trim = FOLLOWED * facts.feed * moved + facts.trim * (level - memory.level + dt / facts.slow * level)
     wanted = np.where(fallback & ~seen.ring, old[0], pull), np.where(blind, old[1] + trim / KILO, heater)
     sound = _finite(wanted[0]) & _finite(wanted[1])
     moves = [

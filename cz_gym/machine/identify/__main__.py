@@ -1,6 +1,4 @@
-"""Identify a puller from its log: ``python -m cz_gym.machine.identify LOG.csv --puller start.toml --out my.toml``."""
-
-from __future__ import annotations
+"""Identify a puller from its logs: ``python -m cz_gym.machine.identify LOG.csv --puller start.toml --out my.toml``."""
 
 import argparse
 import sys
@@ -13,39 +11,49 @@ from cz_gym.support.atomic_files import check_writable, write_files
 from cz_gym.support.command_line import OneLineParser
 
 from .estimate import identify
-from .log import COLUMNS, check_puller, column_map, read_log
+from .log import check_puller, column_map, read_log
+from .table import COLUMNS
+
+NO_FIT = 3
+"""Exit code where the model does not fit the log."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser("python -m cz_gym.machine.identify", "Identify a puller from its log.")
+    parser = OneLineParser("python -m cz_gym.machine.identify", "Identify a puller from its logs.")
     add = parser.add_argument
-    add("log", type=Path, help=f"CSV or Parquet file with the columns {', '.join(COLUMNS)}")
+    add("log", type=Path, nargs="+", help=f"CSV or Parquet file of one machine, with the columns {', '.join(COLUMNS)}")
     add("--puller", default="default", help="puller file to start from (default: %(default)s)")
     add("--out", type=Path, required=True, help="puller file to write; its report stands beside it")
     named = "NAME=COLUMN[:UNIT]"
     add("--column", action="append", default=[], metavar=named, help="a column with another name or unit")
     add("--columns", type=Path, metavar="FILE", help='TOML file with lines NAME = "COLUMN:UNIT"')
     add("--prior", action="append", default=[], metavar="NAME=SD", help="sd of the logarithm of a start value")
+    add("--force", action="store_true", help="write the puller file although the model does not fit the log")
     return parser.run(_main, arguments, "plant")
 
 
-def _main(given: argparse.Namespace) -> None:
+def _main(given: argparse.Namespace) -> int:
     from .report import report
 
     if given.out.suffix != ".toml":
         raise CzError(f"--out must be a file NAME.toml, not {given.out}")
     start = find_puller(given.puller)
-    log = read_log(given.log, column_map(given.column, given.columns))
-    check_puller(log, start)
+    logs = [read_log(path, column_map(given.column, given.columns)) for path in given.log]
+    for path, log in zip(given.log, logs, strict=True):
+        check_puller(log, start, str(path))
     check_writable(given.out.parent)
-    found = identify(log, start, dict(map(_prior, given.prior)))
-    page = given.out.with_suffix(".md")
-    write_files(report(found, log, given.log.name, page) | {given.out: to_toml(found.puller).encode()})
+    found = identify(logs, start, dict(map(_prior, given.prior)))
+    page, files = given.out.with_suffix(".md"), dict[Path, bytes]()
+    if given.force or not found.misfits:
+        files[given.out] = to_toml(found.puller).encode()
+    print(found.verdict)
+    write_files(report(found, logs, ", ".join(path.name for path in given.log), page) | files)
     for e in found.estimates:
         said = f"{e.value:.4g} ({e.low:.4g} to {e.high:.4g})" if e.informed else "this log says nothing about it"
         print(f"{e.name}: {said}")
-    print(f"wrote {given.out} and {page}")
+    print(f"wrote {' and '.join(map(str, (*files, page)))}")
+    return NO_FIT if found.misfits else 0
 
 
 def _prior(text: str) -> tuple[str, float]:

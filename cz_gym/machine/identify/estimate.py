@@ -1,15 +1,12 @@
 """Maximum a posteriori of the filter's prediction errors: what a log tells of a puller, and what it does not."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
-from scipy.stats import chi2
 
 from cz_gym.errors import CzError
 from cz_gym.machine.puller import DEFAULT, PullerFile
@@ -17,13 +14,20 @@ from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.support.names import unknown
 
-from .log import Floats, Log
-from .model import LAM, Model, Noise, Predicted, sensitivities
+from .grid import Floats, Log, join, prepare, shift_drives
+from .model import LAM, Lags, Model, Noise, Predicted, sensitivities
+from .moves import measure_excitation
+from .verdict import misfits, whiteness
 
 HEATER = ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b", "eps", "k_l")
 """Parameters of the path from the heater."""
 PULL = ("sigma", "lam")
 """Parameters of the path from the pull speed to the ring; ``lam`` stands for the product lam dT_0."""
+LAGS = Lags._fields
+"""Delays of the heater's path; a log tells their sum better than each."""
+SHORT, LAG_SD, DEAD_SD = 2.0, 1.5, 5.0
+"""Median of a lag that the start does not have [s], standard deviation of a lag's logarithm [-] and of the dead
+time [s]."""
 PRIOR_SD, NOISE_SD = 0.35, 1.0
 """Standard deviation of the logarithm of a parameter, and of the strength of a noise [-]."""
 LAM_SD = 0.3
@@ -33,11 +37,8 @@ WIDER = 1.3
 studies.identify`` counts the intervals that hold the truth."""
 INFORMED = 0.5
 """An informed parameter keeps less than this share of the prior's standard deviation [-]."""
-MOVE, ENOUGH, PAST = 0.005, 20 * 0.02**2, 6
-"""Unexplained moves count from this share of nominal on; their squares must add up to those of 20 steps of 2 %. PAST
-values of every signal explain a move."""
-LAGS, WHITE = 20, 0.01
-"""Lags of the whiteness test, and the probability below which residuals count as coloured."""
+AT_REST = 8, 0.02
+"""The search ends where as many steps have gained less: a dead time of whole rows is a kink, where it cannot go on."""
 CAUTIOUS = {"pyrometer_sd": 20.0, "camera_sd": 4.0}
 """Factors on the noise where the search begins, so that the filter of a wrong puller can follow the log."""
 
@@ -55,11 +56,13 @@ class Estimate(NamedTuple):
     """Share of the prior's standard deviation that is left [-]."""
     excited: bool = True
     """Whether its drive moved enough; without that it is not estimated."""
+    trusted: bool = True
+    """Whether the model fits the log; of a lag, whether there is a delay at all."""
 
     @property
     def informed(self) -> bool:
         """Whether the log says enough for the value to be used."""
-        return self.left < INFORMED
+        return self.trusted and self.left < INFORMED
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ class Identified:
 
     start: PullerFile
     estimates: tuple[Estimate, ...]
-    """Of HEATER and PULL."""
+    """Of HEATER, LAGS and PULL."""
     noise: tuple[Estimate, ...]
     """Of :class:`Noise`."""
     excitation: tuple[float, float]
@@ -76,27 +79,40 @@ class Identified:
     errors: Floats
     """Prediction errors of pyrometer and ring in their standard deviations, shape (rows, 2); NaN without a reading."""
     predicted: Predicted
+    log: Log
+    """The logs one after the other, in the rows that were estimated from."""
     settled: bool
     """Whether the search has ended at a maximum."""
+    misfits: tuple[str, ...] = ()
+    """Why the model does not fit the log, in words; empty if it does."""
 
     @property
     def puller(self) -> PullerFile:
-        """The start with the numbers that the log tells: parameters, and the noise of camera and pyrometer.
+        """The start with the numbers that the log tells: parameters, lags, and the noise of camera and pyrometer.
 
-        ``lam`` is none of them: each crystal of a scenario draws its own.
+        ``lam`` is none of them: each crystal of a scenario draws its own. Where the model does not fit, the numbers are
+        what explains the log best all the same.
         """
-        told = {e.name: e.value for e in (*self.estimates, *self.noise) if e.informed}
-        sensors: dict[str, Any] = {
-            name: (told[sd], told[sd])
-            for name, sd in (("camera_noise", "camera_sd"), ("pyrometer_noise", "pyrometer_sd"))
-            if sd in told
-        }
-        parameters = {name: value for name, value in told.items() if name in Parameters._fields}
-        return replace(
-            self.start,
-            parameters=self.start.parameters._replace(**parameters),
-            **sensors,
-        )
+        sure = {e.name: e.value for e in (*self.estimates, *self.noise) if e.left < INFORMED}
+        names = {"camera_sd": "camera_noise", "pyrometer_sd": "pyrometer_noise"}
+        ranges = {own: sure[name] for name, own in names.items() if name in sure}
+        ranges |= {e.name: max(e.value, 0.0) for e in self.estimates if e.name in LAGS and e.excited and self.delayed}
+        parameters = {name: value for name, value in sure.items() if name in Parameters._fields}
+        own: dict[str, Any] = {name: (value, value) for name, value in ranges.items()}
+        return replace(self.start, parameters=self.start.parameters._replace(**parameters), **own)
+
+    @property
+    def verdict(self) -> str:
+        """One line: whether the model fits the log, or why it does not."""
+        if self.misfits:
+            return f"THE MODEL DOES NOT FIT: {'; '.join(self.misfits)}"
+        moved = [drive for drive, share in zip(("pull speed", "heater"), self.excitation, strict=True) if share >= 1.0]
+        return f"the model fits the log; moves of their own: {', '.join(moved) or 'none, so the log tells nothing'}"
+
+    @property
+    def delayed(self) -> bool:
+        """Whether the heater's path has a delay that the model's equations do not have."""
+        return any(e.trusted for e in self.estimates if e.name in LAGS and e.excited)
 
     @property
     def whiteness(self) -> tuple[float, float]:
@@ -105,76 +121,93 @@ class Identified:
 
 
 def identify(
-    log: Log,
+    log: Log | Sequence[Log],
     start: PullerFile = DEFAULT,
     prior_sd: Mapping[str, float] | None = None,
     meniscus: MeniscusModel = HURLE,
 ) -> Identified:
-    """Estimate what the log tells of a puller; parameters of a path that is not excited are left alone.
+    """Estimate what one or several logs tell of a puller; parameters of a path that is not excited are left alone.
 
-    ``start`` holds the prior's medians, ``prior_sd`` standard deviations of logarithms other than PRIOR_SD.
+    ``start`` holds the prior's medians, ``prior_sd`` standard deviations of logarithms other than PRIOR_SD. Drives that
+    seem to act before they do are moved by a row: the log's row then holds what came after its readings.
     """
+    logs = (log,) if isinstance(log, Log) else tuple(log)
+    sds = _prior_sds(prior_sd or {})
+    moved = tuple(map(float, np.sum([measure_excitation(each, start) for each in logs], axis=0)))
+    free = (*((*HEATER, *LAGS) if moved[1] >= 1.0 else ()), *(PULL if moved[0] >= 1.0 else ()))
+    model = Model((*free, *Noise._fields), start.parameters, meniscus, _lags_of(start))
+    sd, latency = np.array([sds[name] for name in model.names]), start.latency or 0.0
+    rows = [prepare(each, latency) for each in logs]
+    found = _maximise(rows, model, sd)
+    if "heater_lag" in free and (total := _delay(found, model))[0] + 2.0 * total[1] < 0.0:
+        logs = tuple(map(shift_drives, logs))
+        rows = [prepare(each, latency) for each in logs]
+        found = _maximise(rows, model, sd)
+
+    def estimate(name: str) -> Estimate:
+        usual = model.value(name, LAM if name == "lam" else 0.0)
+        if name not in model.names:
+            return Estimate(name, usual, usual, usual, usual, 1.0, excited=False)
+        j = model.names.index(name)
+        low, value, high = (model.value(name, found.theta[j] + sign * 1.96 * found.sd[j]) for sign in (-1.0, 0.0, 1.0))
+        delay = name not in LAGS or np.subtract(*(_delay(found, model) * (1.0, 2.0))) > 0.0
+        return Estimate(name, usual, value, low, high, found.sd[j] / sd[j], trusted=bool(delay))
+
+    whole = join(rows)
+    read = np.isfinite([whole.T_1, whole.ring]).T
+    errors = np.where(read, found.out.error / np.sqrt(found.out.variance), np.nan)
+    told, noise = tuple(map(estimate, (*HEATER, *LAGS, *PULL))), tuple(map(estimate, Noise._fields))
+    result = Identified(start, told, noise, moved, errors, found.out, whole, found.settled)
+    reasons = misfits(
+        result, model.puller(found.theta + 0j), dict(zip(model.names, (found.theta - model.mean) / sd, strict=True))
+    )
+    if reasons:
+        told, noise = (tuple(e._replace(trusted=False) for e in each) for each in (told, noise))
+    return replace(result, estimates=told, noise=noise, misfits=reasons)
+
+
+def _prior_sds(given: Mapping[str, float]) -> dict[str, float]:
     sds = dict.fromkeys((*HEATER, *PULL), PRIOR_SD) | dict.fromkeys(Noise._fields, NOISE_SD) | {"lam": LAM_SD}
-    for name, value in (prior_sd or {}).items():
+    sds |= {"heater_lag": LAG_SD, "pyrometer_filter": LAG_SD, "heater_dead_time": DEAD_SD}
+    for name, value in given.items():
         if name not in sds or not 0.0 < value < np.inf:
             raise CzError(unknown("parameter", name, sds) if name not in sds else f"prior of {name}: {value!r}")
         sds[name] = value
-    moved = measure_excitation(log, start)
-    free = (*(HEATER if moved[1] >= 1.0 else ()), *(PULL if moved[0] >= 1.0 else ()))
-    model = Model((*free, *Noise._fields), start.parameters, meniscus)
-    sd = np.array([sds[name] for name in model.names])
-    theta, spread, out, settled = _maximise(log, model, sd)
-
-    def estimate(name: str) -> Estimate:
-        prior = model.value(name, LAM if name == "lam" else 0.0)
-        if name not in model.names:
-            return Estimate(name, prior, prior, prior, prior, 1.0, excited=False)
-        j = model.names.index(name)
-        low, value, high = (model.value(name, theta[j] + sign * 1.96 * spread[j]) for sign in (-1.0, 0.0, 1.0))
-        return Estimate(name, prior, value, low, high, spread[j] / sd[j])
-
-    read = np.isfinite([log.T_1, log.ring]).T
-    errors = np.where(read, out.error / np.sqrt(out.variance), np.nan)
-    told, noise = tuple(map(estimate, (*HEATER, *PULL))), tuple(map(estimate, Noise._fields))
-    return Identified(start, told, noise, moved, errors, out, settled)
+    return sds
 
 
-def measure_excitation(log: Log, start: PullerFile = DEFAULT) -> tuple[float, float]:
-    """:func:`excitation` of pull speed and heater."""
-    errors = np.stack([log.ring - np.nan_to_num(log.r_ref), log.T_1 - np.nan_to_num(log.T_1_ref)], axis=1)
-    return excitation(log.v_p / start.parameters.v_0, errors), excitation(log.Q_H / np.median(log.Q_H), errors)
+def _lags_of(start: PullerFile) -> Lags:
+    lag, dead, slow = (float(np.mean(getattr(start, name) or 0.0)) for name in LAGS)
+    return Lags(lag or SHORT, dead, slow or SHORT)
 
 
-def excitation(drive: Floats, readings: Floats) -> float:
-    """How much a drive, in shares of nominal, moves on its own; 1 is just enough.
+class Maximum(NamedTuple):
+    """The posterior's maximum."""
 
-    A linear regression of its moves on the last values of drive and readings explains what a controller does, at the
-    controller's own pace. The moves that it leaves unexplained count.
-    """
-    at = np.flatnonzero(np.diff(drive)) + 1
-    pace = int(np.median(np.diff(at))) if len(at) > 1 else 1
-    at = at[at >= PAST * pace]
-    series = np.column_stack([drive, readings])
-    past = np.concatenate([series[at - 1 - lag * pace] for lag in range(PAST)], axis=1)
-    good = np.isfinite(past).all(axis=1)
-    if good.sum() < 2 * past.shape[1]:
-        return 0.0
-    move, X = (drive[at] - drive[at - 1])[good], past[good] - past[good].mean(axis=0)
-    X = np.column_stack([X / np.maximum(X.std(axis=0), 1e-12), np.ones(len(X))])
-    left = move - X @ np.linalg.lstsq(X, move, rcond=1e-10)[0]
-    return float(np.square(left[np.abs(left) > MOVE]).sum() / ENOUGH)
+    theta: Floats
+    """Free numbers."""
+    covariance: Floats
+    """Theirs."""
+    out: Predicted
+    """The filter's output there."""
+    settled: bool
+
+    @property
+    def sd(self) -> Floats:
+        """Standard deviations of the free numbers."""
+        return np.sqrt(np.diag(self.covariance))
 
 
-def whiteness(errors: Floats) -> float:
-    """Ljung and Box's probability over LAGS lags; NaN errors are where nothing was read."""
-    u = np.nan_to_num(errors - np.nanmean(errors))
-    n, lags = int(np.isfinite(errors).sum()), np.arange(1, LAGS + 1)
-    correlations = np.array([u[lag:] @ u[:-lag] for lag in lags]) / (u @ u)
-    return float(chi2.sf(n * (n + 2) * np.sum(np.square(correlations) / (n - lags)), LAGS))
+def _delay(found: Maximum, model: Model) -> Floats:
+    """Sum of the lags and its standard deviation [s], shape (2,)."""
+    lags = model.delays(found.theta)
+    slopes = {"heater_lag": lags.heater_lag, "heater_dead_time": 1.0, "pyrometer_filter": lags.pyrometer_filter}
+    slope = np.array([slopes.get(name, 0.0) for name in model.names])
+    return np.array([sum(lags), np.sqrt(slope @ found.covariance @ slope)])
 
 
-def _maximise(log: Log, model: Model, sd: Floats) -> tuple[Floats, Floats, Predicted, bool]:
-    """The posterior's maximum, standard deviations by its curvature, the filter's output there, and whether it settled.
+def _maximise(logs: Sequence[Log], model: Model, sd: Floats) -> Maximum:
+    """The posterior's maximum, where the search ends or began if the filter cannot follow the log.
 
     The curvature is Fisher's information of Gaussian prediction errors, so no second derivatives are needed.
     """
@@ -182,7 +215,9 @@ def _maximise(log: Log, model: Model, sd: Floats) -> tuple[Floats, Floats, Predi
     @lru_cache(maxsize=2)
     def posterior(packed: bytes) -> tuple[float, Floats, Floats, Predicted]:
         away = np.frombuffer(packed)
-        out, E, S = sensitivities(log, model, model.mean + away * sd)
+        parts = [sensitivities(log, model, model.mean + away * sd) for log in logs]
+        out = Predicted(*(np.concatenate(each) for each in zip(*(part[0] for part in parts), strict=True)))
+        E, S = (np.concatenate([part[k] for part in parts], axis=1) for k in (1, 2))
         e, s = out.error, out.variance
         if not (np.isfinite(E).all() and np.isfinite(S).all() and s.min() > 0.0):
             return np.inf, np.zeros(len(away)), np.eye(len(away)), out
@@ -194,18 +229,24 @@ def _maximise(log: Log, model: Model, sd: Floats) -> tuple[Floats, Floats, Predi
     def part(index: int) -> Callable[[Floats], Any]:
         return lambda x: posterior(x.tobytes())[index]
 
-    first = _plausible_start(log, model, sd)
-    found = minimize(
-        part(0), first, jac=part(1), hess=part(2), method="trust-exact", options={"gtol": 0.1, "maxiter": 200}
-    )
-    value, _, curvature, out = posterior(found.x.tobytes())
-    if not np.isfinite(value):
-        raise CzError("the filter cannot follow this log from these parameters: is it another puller's?")
-    spread = WIDER * np.sqrt(np.diag(np.linalg.inv(curvature)))
-    return model.mean + found.x * sd, spread * sd, out, bool(found.success)
+    away, settled = _plausible_start(logs, model, sd), False
+    values = [posterior(away.tobytes())[0]]
+
+    def stop_at_rest(intermediate_result: Any) -> None:
+        values.append(float(intermediate_result.fun))
+        if len(values) > AT_REST[0] and values[-AT_REST[0]] - values[-1] < AT_REST[1]:
+            raise StopIteration
+
+    if np.isfinite(values[0]):
+        options: Any = {"gtol": 0.1, "maxiter": 100}
+        how: Any = {"jac": part(1), "hess": part(2), "method": "trust-exact", "callback": stop_at_rest}
+        away = minimize(part(0), away, options=options, **how).x
+        settled = len(values) <= options["maxiter"]
+    _, _, curvature, out = posterior(away.tobytes())
+    return Maximum(model.mean + away * sd, WIDER**2 * np.linalg.inv(curvature) * np.outer(sd, sd), out, settled)
 
 
-def _plausible_start(log: Log, model: Model, sd: Floats) -> Floats:
+def _plausible_start(logs: Sequence[Log], model: Model, sd: Floats) -> Floats:
     """A start in prior standard deviations: its operating point has the log's mean temperature and power, nearly."""
     away = np.zeros(len(sd))
     for name, factor in CAUTIOUS.items():
@@ -213,7 +254,7 @@ def _plausible_start(log: Log, model: Model, sd: Floats) -> Floats:
         away[j] = np.log(factor) / sd[j]
     if "G_1a" not in model.names:
         return away
-    T_1, Q_H = np.nanmean(log.T_1), np.mean(log.Q_H)
+    T_1, Q_H = (np.nanmean(np.concatenate([getattr(log, name) for log in logs])) for name in ("T_1", "Q_H"))
 
     def misfit(x: Floats) -> Floats:
         p = model.puller(model.mean + x * sd)

@@ -1,12 +1,11 @@
 """The filter whose prediction errors are made small: an extended Kalman filter on the plant, and its derivatives.
 
-Eleven states: the plant's five, a fast and a slow fluctuation of the interface temperature [K], a heat load on the melt
-[W] with its rate [W/s], and the constant offsets of pyrometer [K] and ring [m]. The mean moves by the plant's
+Twelve states: the plant's five, a fast and a slow fluctuation of the interface temperature [K], a heat load on the melt
+[W] with its rate [W/s], the constant offsets of pyrometer [K] and ring [m], and T_1 behind the pyrometer's filter [K].
+The heater's lag and dead time act on the log's power before it reaches the filter. The mean moves by the plant's
 equations, the covariance by the plant linearised at its operating point. The loop takes complex numbers: a complex step
 through it gives the derivatives of every prediction error, and of its variance, by a parameter.
 """
-
-from __future__ import annotations
 
 import math
 from functools import lru_cache
@@ -15,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import expm
+from scipy.signal import lfilter
 
 from cz_gym.body.plant import Disturbance, Inputs, State, derive_puller, rates, rk4
 from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
@@ -24,13 +24,15 @@ from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.support.units import MM
 
-from .log import Floats, Log
+from .grid import Floats, Log
 
 Numbers = npt.NDArray[np.complex128]
-STATES = (*State._fields, "fast", "slow", "load", "load_rate", "pyrometer_offset", "ring_offset")
-FAST, SLOW, LOAD, RATE, PYROMETER, RING = range(5, len(STATES))
+STATES = (*State._fields, "fast", "slow", "load", "load_rate", "pyrometer_offset", "ring_offset", "shown")
+FAST, SLOW, LOAD, RATE, PYROMETER, RING, SHOWN = range(5, len(STATES))
 LONGEST_STEP = 5.0
 """Longest step of the integration [s]."""
+QUICKEST = 1e-6
+"""Time constant of a pyrometer without a filter [s]."""
 _STEP, _SHARE = 1e-30, 1e-6
 
 
@@ -47,6 +49,17 @@ class Noise(NamedTuple):
     """The one of 780 s [K]."""
     load_rate: Any = 1e-5
     """Rate of the heat load on the melt, in shares of the heat that passes through it [1/s]."""
+
+
+class Lags(NamedTuple):
+    """What delays the heater's path."""
+
+    heater_lag: Any = 0.0
+    """Time constant with which the power that heats follows the log's [s]."""
+    heater_dead_time: Any = 0.0
+    """Time before it begins to follow [s]; negative where the log's row holds the power that comes after it."""
+    pyrometer_filter: Any = 0.0
+    """Time constant of the pyrometer's filter [s]."""
 
 
 LAM = 0.5
@@ -72,7 +85,7 @@ class Predicted(NamedTuple):
     error: Any
     variance: Any
     state: Any
-    """Estimated states after each row, shape (rows, 11)."""
+    """Estimated states after each row, shape (rows, 12)."""
 
 
 @lru_cache(maxsize=4)
@@ -81,8 +94,8 @@ def build_filter(meniscus: MeniscusModel) -> Any:
     slope, ring_offset = meniscus.slope, meniscus.ring_offset
 
     def run(
-        p: Any, A: Any, Q: Any, z: Any, start: Any, R: Any, read: Any, drives: Any, gap: Any, dt: Any, parts: Any,
-        lowest: Any, highest: Any, error: Any, variance: Any, states: Any,
+        p: Any, A: Any, Q: Any, z: Any, start: Any, R: Any, read: Any, drives: Any, unsure: Any, gap: Any, slow: Any,
+        dt: Any, parts: Any, lowest: Any, highest: Any, error: Any, variance: Any, states: Any,
     ) -> None:  # fmt: skip
         P, A_t = start, np.ascontiguousarray(A.T)
         for k in range(read.shape[0]):
@@ -91,16 +104,20 @@ def build_filter(meniscus: MeniscusModel) -> Any:
                 d = Disturbance(z[7], z[5] + z[6], 1.0 + 0.0 * z[0])
                 for _ in range(parts):
                     x = rk4(x, u, d, p, dt / parts, slope)
+                lag = slow * (x.T_1 - z[2]) / dt
+                shown = x.T_1 - lag + (z[11] - z[2] + lag) * np.exp(-dt / slow)
                 z = A @ z
-                z[0], z[1], z[2], z[3], z[4] = x.r_c, x.h_c, x.T_1, x.T_2, x.T_b
-                P = start if gap[k] else A @ P @ A_t + Q
+                z[0], z[1], z[2], z[3], z[4], z[11] = x.r_c, x.h_c, x.T_1, x.T_2, x.T_b, shown
+                P = start.copy() if gap[k] else A @ P @ A_t + Q
+                P[1, 1] += (dt * unsure[k, 0]) ** 2
+                P[2, 2] += (dt * unsure[k, 1] / p.C_1) ** 2
             for sensor in range(2):
                 error[k, sensor], variance[k, sensor] = 0.0, 1.0
                 if np.isnan(read[k, sensor]):
                     continue
                 H = np.zeros_like(z)
                 if sensor == 0:
-                    H[2], H[9], expected = 1.0, 1.0, z[2] + z[9]
+                    H[11], H[9], expected = 1.0, 1.0, z[11] + z[9]
                 else:
                     near, far = _SHARE * z[0], _SHARE * z[1]
                     H[0] = 1.0 + (ring_offset(z[0] + near, z[1], p) - ring_offset(z[0] - near, z[1], p)) / (2.0 * near)
@@ -118,26 +135,42 @@ def build_filter(meniscus: MeniscusModel) -> Any:
 
 
 class Model(NamedTuple):
-    """The map from free numbers to a puller and its noise: logarithms of factors, and ``lam`` itself."""
+    """The map from free numbers to a puller, its lags and its noise: logarithms of factors, ``lam`` and the heater's
+    dead time themselves.
+    """
 
     names: tuple[str, ...]
-    """The free ones, of Parameters, Noise and ``lam``."""
+    """The free ones, of Parameters, Lags, Noise and ``lam``."""
     start: Parameters
     meniscus: MeniscusModel = HURLE
+    lags: Lags = Lags()
+    """The start's; factors refer to them."""
 
     @property
     def mean(self) -> Any:
         """The free numbers of the start, shape (names,)."""
-        return np.array([LAM if name == "lam" else 0.0 for name in self.names])
+        plain = {"lam": LAM, "heater_dead_time": self.lags.heater_dead_time}
+        return np.array([plain.get(name, 0.0) for name in self.names])
 
     def value(self, name: str, at: float) -> float:
-        """The parameter or noise where its free number is ``at``; of ``lam``, the product lam dT_0 [K]."""
-        if name == "lam":
-            return at * self.start.dT_0
-        return float(getattr(Noise() if name in Noise._fields else self.start, name) * np.exp(at))
+        """The number where its free number is ``at``; of ``lam``, the product lam dT_0 [K]."""
+        if name in ("lam", "heater_dead_time"):
+            return at * self.start.dT_0 if name == "lam" else at
+        start = next(part for part in (Noise(), self.lags, self.start) if name in part._fields)
+        return float(getattr(start, name) * np.exp(at))
+
+    def delays(self, theta: Any) -> Lags:
+        """The lags of free numbers, real or complex, shape (names,)."""
+        free = dict(zip(self.names, theta, strict=True))
+        lag, dead_time, slow = self.lags
+        return Lags(
+            lag * np.exp(free.get("heater_lag", 0.0)),
+            free.get("heater_dead_time", dead_time),
+            slow * np.exp(free.get("pyrometer_filter", 0.0)),
+        )
 
     def puller(self, theta: Any) -> Any:
-        """The puller of free numbers, real or complex, shape (names,)."""
+        """The puller of free numbers, as :meth:`delays`."""
         free = dict(zip(self.names, theta, strict=True))
         factors = {name: np.exp(value) for name, value in free.items() if name in Parameters._fields}
         q = self.start._replace(**{name: getattr(self.start, name) * factor for name, factor in factors.items()})
@@ -146,7 +179,7 @@ class Model(NamedTuple):
         return derive_puller(numbers, free.get("lam", LAM) + zero, self.meniscus.height, self.meniscus.ring_offset)
 
     def noises(self, theta: Any) -> Noise:
-        """The noise of free numbers, as :meth:`puller`."""
+        """The noise of free numbers, as :meth:`delays`."""
         free = dict(zip(self.names, theta, strict=True))
         return Noise(*(usual * np.exp(free.get(name, 0.0)) for name, usual in Noise()._asdict().items()))
 
@@ -155,7 +188,9 @@ def predict(log: Log, model: Model, theta: Any) -> Predicted:
     """Run the filter of the free numbers ``theta``, shape (names,), real or complex, over a log."""
     p, noise, meniscus = model.puller(np.asarray(theta, np.complex128)), model.noises(theta), model.meniscus
     through = p.Q_H_0 - p.G_1a * (p.T_1_0 - p.T_a)
-    A, Q = _sampled(p, noise, through, log.interval, meniscus)
+    delays = model.delays(theta)
+    slow = np.complex128(delays.pyrometer_filter + QUICKEST)
+    A, Q = _sampled(p, noise, through, slow, log.interval, meniscus)
     z, P = np.zeros(len(STATES), np.complex128), np.zeros((len(STATES),) * 2, np.complex128)
     z[:5] = p.state_0
     known = np.isfinite(log.r_ref).all()
@@ -165,18 +200,38 @@ def predict(log: Log, model: Model, theta: Any) -> Predicted:
     for state, sd in (*enumerate(START_SD), *start_sd.items(), (PYROMETER, OFFSET_SD[0]), (RING, OFFSET_SD[1])):
         P[state, state] = sd**2
     warmer = p.T_1_0**3 / (p.T_2_0**3 + p.G_2b / (4.0 * p.kappa_12))
-    drift = DRIFT_SD * np.array([0.0, 0.0, 1.0, warmer, 0.0, 0.0, 0.0, -p.G_2b * warmer, 0.0, 0.0, 0.0])
+    drift = DRIFT_SD * np.array([0.0, 0.0, 1.0, warmer, 0.0, 0.0, 0.0, -p.G_2b * warmer, *[0.0] * 4])
     P = P + np.outer(drift, drift)
+    z[SHOWN], P[SHOWN], P[:, SHOWN] = z[2], P[2], P[:, 2]
+    P[SHOWN, SHOWN] = P[2, 2]
     rows, parts = len(log.time), math.ceil(log.interval / LONGEST_STEP - 1e-9)
     out = Predicted(*(np.zeros((rows, width), np.complex128) for width in (2, 2, len(STATES))))
-    R = np.array([noise.pyrometer_sd**2, noise.camera_sd**2], np.complex128) + np.square(FLOOR)
-    read, drives = np.stack([log.T_1, log.ring], axis=1), np.stack([log.v_p, log.Q_H], axis=1)
+    R = np.array([noise.pyrometer_sd**2, noise.camera_sd**2], np.complex128) / log.mean_of + np.square(FLOOR)
+    read, drives = np.stack([log.T_1, log.ring], axis=1), np.stack([log.v_p, heating(log, delays)], axis=1)
     limits = HEIGHT_MIN, HEIGHT_MAX_IN_A * float(p.a.real)
-    build_filter(meniscus)(p, A, Q, z, P, R, read, drives, log.gap, log.interval, parts, *limits, *out)
+    steps = log.unsure, log.gap, slow, log.interval, parts
+    build_filter(meniscus)(p, A, Q, z, P, R, read, drives, *steps, *limits, *out)
     return out
 
 
-def _sampled(p: Any, noise: Noise, through: Any, dt: float, meniscus: MeniscusModel) -> tuple[Numbers, Numbers]:
+def heating(log: Log, delays: Lags) -> Numbers:
+    """Mean power that heats in the interval before each row [W], shape (rows,)."""
+    late, n, dt = delays.heater_dead_time / log.interval, len(log.Q_H), log.interval
+    whole = math.floor(late.real)
+    first, second = (log.Q_H[np.clip(np.arange(n) - whole - k, 0, n - 1)] for k in (0, 1))
+    arrives: Numbers = (first + (late - whole) * (second - first)).astype(np.complex128)
+    if not delays.heater_lag.real:
+        return arrives
+    keep = np.exp(-dt / delays.heater_lag)
+    begins = np.array([keep * arrives[0]])
+    follows, _ = lfilter([1.0 - keep], [1.0, -keep], arrives, zi=begins)
+    before = np.concatenate([arrives[:1], follows[:-1]])
+    return arrives + (before - arrives) * (1.0 - keep) * delays.heater_lag / dt
+
+
+def _sampled(
+    p: Any, noise: Noise, through: Any, slow: Any, dt: float, meniscus: MeniscusModel
+) -> tuple[Numbers, Numbers]:
     """Transition over dt [s] at the operating point, and the covariance of the disturbances in it (Van Loan 1978)."""
     n = len(STATES)
     F, Q = np.zeros((n, n), np.complex128), np.zeros((n, n), np.complex128)
@@ -191,7 +246,7 @@ def _sampled(p: Any, noise: Noise, through: Any, dt: float, meniscus: MeniscusMo
         column = (motion(point + shift) - motion(point - shift)) / (2.0 * shift[j])
         for state in ((j,), (LOAD,), (FAST, SLOW))[max(j - 4, 0)]:
             F[:5, state] = column
-    F[LOAD, RATE] = 1.0
+    F[LOAD, RATE], F[SHOWN, 2], F[SHOWN, SHOWN] = 1.0, 1.0 / slow, -1.0 / slow
     A = expm(F * dt)
     for state, sd, tau in (
         (FAST, noise.fast_sd, TAU_FAST),

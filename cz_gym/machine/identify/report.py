@@ -1,7 +1,6 @@
 """Report of an identification: Markdown with two pictures."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,10 @@ from cz_gym.evaluation.report.tables import markdown
 from cz_gym.physics.parameters import describe
 from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN, PERCENT
 
-from .estimate import WHITE, Estimate, Identified
-from .log import Log
+from .estimate import Estimate, Identified
+from .grid import Log
+from .model import Lags
+from .verdict import WHITE
 
 CALLIPER = 0.05 * MM
 """Error of a calliper's reading of the radius [m]."""
@@ -24,24 +25,30 @@ OTHERS = {
     "fast_sd": ("melt, fast fluctuation", "K"),
     "slow_sd": ("melt, slow fluctuation", "K"),
     "load_rate": ("hot zone, rate of drift", "1/s"),
+    "heater_lag": ("heater's lag", "s"),
+    "heater_dead_time": ("heater's dead time", "s"),
+    "pyrometer_filter": ("pyrometer's filter", "s"),
 }
 """Names and units of the numbers that are no parameters."""
 HEADS = "number", "unit", "start", "log", "95 % interval", "uncertainty left [%]", "verdict"
 
 
-def report(found: Identified, log: Log, source: str, path: Path) -> dict[Path, bytes]:
+def report(found: Identified, log: Log | Sequence[Log], source: str, path: Path) -> dict[Path, bytes]:
     """The files of a report, its text at ``path``: what the log ``source`` tells of a puller, and what it does not."""
     readings, numbers = (path.with_name(f"{path.stem}-{name}.png") for name in ("readings", "numbers"))
     told, moves = sum(e.informed for e in found.estimates), zip(("pull speed", "heater"), found.excitation, strict=True)
     white = zip(("pyrometer", "ring"), found.whiteness, strict=True)
-    text = f"""# What {source} tells of the puller {found.start.name}
+    logs = (log,) if isinstance(log, Log) else log
+    lines = [f"- {len(each.time)} rows of {each.interval:g} s; {_notes(each)}." for each in logs]
+    text = f"""# {found.verdict[0].upper() + found.verdict[1:]}
 
-The log tells {told} of {len(found.estimates)} numbers of the puller; the others keep the start's values.
-{"" if found.settled else "**The search has not settled: do not use these numbers.**"}
+The log {source} tells {told} of {len(found.estimates)} numbers of the puller {found.start.name}; the others keep the
+start's values.
+
 {markdown(HEADS, map(_row, (*found.estimates, *found.noise)), "---")}
 
 "Uncertainty left" compares the estimate's standard deviation with the start's; below 50 % the log tells the number.
-A log gives lam and dT_0 only as their product, and no phi_b.
+A log gives lam and dT_0 only as their product, the delays of the heater's path best as their sum, and no phi_b.
 
 ![start and estimates]({numbers.name})
 
@@ -57,20 +64,26 @@ A log gives lam and dT_0 only as their product, and no phi_b.
 
 ## What one calliper reading would add
 
-{_calliper(found, log)}
+{_calliper(found)}
 
 ## The log
 
-{len(log.time)} rows of {log.interval:g} s; {"; ".join(log.notes) or "nothing was left out"}.
+{chr(10).join(lines)}
 """
-    return {path: text.encode(), readings: _readings(found, log), numbers: _numbers(found)}
+    return {path: text.encode(), readings: _readings(found), numbers: _numbers(found)}
+
+
+def _notes(log: Log) -> str:
+    return "; ".join(log.notes) or "nothing was left out"
 
 
 def _row(e: Estimate) -> tuple[str, ...]:
     name, unit = OTHERS.get(e.name) or (e.name, describe()[e.name].unit)
     if not e.excited:
         return name, unit, f"{e.prior:.4g}", "-", "-", "-", "not estimated: its drive was not excited"
-    verdict = "told" if e.informed else "this log says nothing about it"
+    verdict = "told" if e.informed else "this log says nothing about it" if e.trusted else "not to be trusted"
+    if e.name in Lags._fields and not e.trusted:
+        verdict = "no delay, or none that this log shows"
     interval = f"{e.low:.4g} to {e.high:.4g}"
     return name, unit, f"{e.prior:.4g}", f"{e.value:.4g}", interval, f"{e.left / PERCENT:.0f}", verdict
 
@@ -89,13 +102,13 @@ def _whiteness(probability: float) -> str:
         return f"the prediction errors are white (p = {probability:.2g}), so the model explains the readings"
     return (
         f"the prediction errors are **not white** (p = {probability:.1g}): something moves the readings that the model "
-        "does not have, and the intervals are too narrow"
+        "does not have, and the intervals may be too narrow"
     )
 
 
-def _calliper(found: Identified, log: Log) -> str:
+def _calliper(found: Identified) -> str:
     """What the ring's offset would say of phi_b if the crystal's radius were known."""
-    parameters, step = found.puller.parameters, 1e-4
+    parameters, log, step = (found.start if found.misfits else found.puller).parameters, found.log, 1e-4
     ring = make_puller(parameters).ring_bias
     slope = (make_puller(parameters._replace(phi_b=parameters.phi_b + step)).ring_bias - ring) / step
     meant = np.where(np.isfinite(log.r_ref), log.r_ref, parameters.r_0)
@@ -108,9 +121,9 @@ def _calliper(found: Identified, log: Log) -> str:
     )
 
 
-def _readings(found: Identified, log: Log) -> bytes:
+def _readings(found: Identified) -> bytes:
     """Drives, readings with their predictions, and prediction errors, as PNG."""
-    figure, hours = canvas(8.0, 8.0), log.time / HOUR
+    figure, log, hours = canvas(8.0, 8.0), found.log, found.log.time / HOUR
     drives, ring, pyrometer, errors = figure.subplots(4, 1, sharex=True)
     drives.plot(hours, log.v_p / MM_PER_MIN, color=COLOURS[1], lw=0.8, label="pull speed [mm/min]")
     power = drives.twinx()

@@ -18,7 +18,7 @@ from cz_gym.config import Config
 from cz_gym.env import CzEnv
 from cz_gym.machine.export.__main__ import FALLBACK, make_block
 from cz_gym.machine.export.ports import INPUTS, OUTPUTS, in_plant_units, settings_of
-from cz_gym.machine.identify.log import COLUMNS
+from cz_gym.machine.identify.table import COLUMNS
 from cz_gym.observation import decode
 from cz_gym.rendering.canvas import Frame
 from cz_gym.rendering.view import record_of

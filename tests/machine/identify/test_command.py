@@ -1,11 +1,15 @@
 """The command: a puller file, a report and pictures; or one line and nothing. The study, on three pullers."""
 
+import shutil
+from dataclasses import replace
+
 import pytest
 
 from cz_gym.machine.identify import __main__ as command
 from cz_gym.machine.puller import read_puller
 from examples import identify as example
 from studies import identify as study
+from studies import other_machine
 
 
 def test_the_command_writes_the_puller_and_its_report(logs, found, tmp_path, monkeypatch):
@@ -19,6 +23,22 @@ def test_the_command_writes_the_puller_and_its_report(logs, found, tmp_path, mon
     assert text.count("| told |") == sum(e.informed for e in (*found.estimates, *found.noise))
     assert "says nothing about it" in text
     assert "calliper" in text
+    assert text.startswith("# The model fits the log")
+
+
+def test_a_model_that_does_not_fit_is_no_result(logs, found, tmp_path, monkeypatch, capsys):
+    doubted = [tuple(e._replace(trusted=False) for e in each) for each in (found.estimates, found.noise)]
+    odd = replace(found, estimates=doubted[0], noise=doubted[1], misfits=("its T_1 is 1796 K where the log says 1758",))
+    monkeypatch.setattr(command, "identify", lambda *_: odd)
+    out = tmp_path / "my.toml"
+    assert command.main([str(logs[0]), str(logs[0]), "--out", str(out)]) == command.NO_FIT
+    assert capsys.readouterr().out.startswith("THE MODEL DOES NOT FIT: its T_1 is 1796 K")
+    text = out.with_suffix(".md").read_text()
+    assert text.startswith("# THE MODEL DOES NOT FIT: its T_1 is 1796 K")
+    assert "| told |" not in text
+    assert not out.exists()
+    assert command.main([str(logs[0]), "--out", str(out), "--force"]) == command.NO_FIT
+    assert read_puller(out).hash == found.puller.hash
 
 
 def test_the_example_goes_from_a_log_to_a_controller(logs, found, tmp_path, monkeypatch):
@@ -37,7 +57,7 @@ def test_the_example_goes_from_a_log_to_a_controller(logs, found, tmp_path, monk
         (["--prior", "C1=0.1"], "did you mean 'C_1'"),
         (["--column", "T_1_K=PYRO"], "unknown column 'PYRO'"),
         (["--column", "ring_mm=DIA"], "unknown column 'ring_mm': did you mean 'ring_radius_mm'"),
-        (["--column", "T_1_K=PYRO:F"], "unknown unit of T_1_K 'F'; choose from K, degC"),
+        (["--column", "T_1_K=PYRO:F"], "unknown unit of T_1_K 'F'; choose from K, degC, degF"),
         (["--column", "T_1_K"], "T_1_K: say which column it is"),
         (["--column", "ring_radius_mm=ring_radius_mm:cm"], "is it another puller's log?"),
         (["--puller", "none.toml"], "none.toml: No such file"),
@@ -55,3 +75,13 @@ def test_the_study_identifies_pullers_that_nobody_knows(tmp_path, capsys):
     text = (tmp_path / "pullers.txt").read_text()
     assert text in capsys.readouterr().out
     assert "tell the pull speed's path: 0\n" in text
+
+
+@pytest.mark.slow
+def test_a_machine_by_somebody_else_is_logged_identified_designed_for_and_driven(tmp_path):
+    if shutil.which("cc") is None:
+        pytest.skip("no C compiler")
+    row = other_machine.chain("heater's lag 10 s", crystals=1)
+    assert not row.found.misfits
+    assert row.lost == (0, 0)
+    assert row.errors[0] < 2.0 * row.errors[1]

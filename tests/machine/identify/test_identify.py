@@ -1,5 +1,6 @@
 """Identification: exact derivatives, exact predictions without noise, and what a log can and cannot tell."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,12 +12,15 @@ from cz_gym.baselines.policy import OpenLoop
 from cz_gym.body.task import HEATER_RANGE
 from cz_gym.errors import CzError
 from cz_gym.machine.identify import Excited, identify, read_log, record_log
-from cz_gym.machine.identify.estimate import HEATER, PULL, measure_excitation, whiteness
+from cz_gym.machine.identify.estimate import HEATER, LAGS, PULL
 from cz_gym.machine.identify.excitation import CHIPS, SEQUENCE
-from cz_gym.machine.identify.log import Log
-from cz_gym.machine.identify.model import LAM, Model, Noise, predict, sensitivities
+from cz_gym.machine.identify.grid import Log, prepare, shift_drives
+from cz_gym.machine.identify.model import LAM, Lags, Model, Noise, heating, predict, sensitivities
+from cz_gym.machine.identify.moves import measure_excitation
+from cz_gym.machine.identify.verdict import coloured, whiteness
 from cz_gym.machine.puller import DEFAULT
 from cz_gym.observation import decode
+from tests.foreign_puller import ForeignPuller, Operator, drive, write_log
 from tests.machine.identify.conftest import TRUTH
 
 
@@ -32,7 +36,7 @@ def test_without_noise_the_filter_of_the_true_puller_predicts_every_reading(inte
 
 def test_derivatives_are_those_of_the_filter(logs):
     log = Log(*(each[:400] if isinstance(each, np.ndarray) else each for each in read_log(logs[0])))
-    model = Model((*HEATER, *PULL, *Noise._fields), Parameters())
+    model = Model((*HEATER, *LAGS, *PULL, *Noise._fields), Parameters(), lags=Lags(2.0, 1.3, 2.0))
     theta, step = model.mean + 0.05, 1e-5
     out, *exact = sensitivities(log, model, theta)
     for j, name in enumerate(model.names):
@@ -43,15 +47,60 @@ def test_derivatives_are_those_of_the_filter(logs):
             assert np.abs((exact[part][j] - differences) / scale).max() < 2e-3, name
 
 
+@pytest.mark.parametrize(("dead_time", "lag"), [(0.0, 0.0), (7.5, 0.0), (5.0, 12.0)])
+def test_the_heat_is_the_power_late_and_slow(dead_time, lag):
+    power, dt, fine = np.repeat([6e4, 7e4, 5e4], 40), 5.0, 100
+    parts = [np.full(9, np.nan)] * 7
+    log = Log(dt * np.arange(120), *parts[:2], power, *parts[:3], np.zeros(120, bool), np.zeros((120, 2)), dt)
+    late, heat, means = np.repeat(power, fine), 6e4, []
+    late = np.concatenate([np.full(round(dead_time / dt * fine), 6e4), late])[: len(late)]
+    for target in late:
+        heat = target if lag == 0.0 else target + (heat - target) * np.exp(-dt / fine / lag)
+        means.append(heat)
+    exact = np.reshape(means, (-1, fine)).mean(axis=1)
+    np.testing.assert_allclose(heating(log, Lags(lag, dead_time)).real, exact, rtol=1e-3)
+
+
+def test_slow_drives_count_and_a_limit_does_not(tmp_path):
+    slow = {
+        "heater_slew": 1e3 / 60,
+        "heater_step": 50.0,
+        "pull_slew": 0.2 / 60,
+        "pull_window": 0.3,
+        "camera_noise": 0.05,
+    }
+    for seed in range(5):
+        for moves, limits in ((0.025, slow), (0.0, slow), (0.0, {})):
+            puller = ForeignPuller(seed=seed, feels=False, **limits)
+            rows = drive(puller, Operator(puller, seed, (moves, moves)).setpoints)
+            log = read_log(write_log(tmp_path / "log.csv", rows))
+            cut = [np.mean(np.abs(move) > 0.98 * np.abs(move).max()) for move in (np.diff(log.v_p), np.diff(log.Q_H))]
+            assert not limits or min(cut) > 0.4
+            start = replace(DEFAULT, parameters=DEFAULT.parameters._replace(v_0=puller.z["v_0"]))
+            assert (np.array(measure_excitation(log, start)) >= 1.0).all() == (moves > 0.0)
+
+
+def test_thinned_rows_are_not_late(logs):
+    log = read_log(logs[0])
+    thin = prepare(log._replace(interval=1.0, time=log.time / 5.0))
+    assert (thin.interval, thin.mean_of) == (11.0, 11)
+    ramp = prepare(log._replace(interval=1.0, time=log.time / 5.0, T_1=log.time / 5.0, Q_H=log.time / 5.0))
+    np.testing.assert_allclose(ramp.T_1, ramp.time, atol=1e-9)
+    np.testing.assert_allclose(ramp.Q_H[2:], ramp.time[2:] - 5.0, atol=1e-9)
+    np.testing.assert_array_equal(shift_drives(log).Q_H[1:], log.Q_H[:-1])
+
+
 def test_a_log_with_excitation_tells_the_hot_zone(found):
     told = {e.name: e for e in found.estimates if e.informed}
     assert found.settled
+    assert not found.misfits
+    assert not found.delayed
     assert {"C_1", "C_2", "kappa_12", "G_1a", "G_2b", "eps"} <= set(told)
     assert np.mean([e.low < getattr(TRUTH, e.name, LAM * TRUTH.dT_0) < e.high for e in told.values()]) >= 0.85
     learned = found.puller.parameters
     np.testing.assert_allclose([learned.C_1, learned.C_2], [TRUTH.C_1, TRUTH.C_2], rtol=0.05)
     changed = {name for name in Parameters._fields if getattr(learned, name) != getattr(Parameters(), name)}
-    assert changed == set(told) - {"lam"}, "what the log does not tell keeps its value"
+    assert changed == set(told) - {"lam", *LAGS}, "what the log does not tell keeps its value"
     assert min(found.excitation) > 5.0
     assert min(found.whiteness) > 0.01
 
@@ -66,7 +115,7 @@ def test_a_log_of_a_controller_alone_tells_nothing(logs):
 def test_a_log_quicker_than_its_controller_is_no_more_excited(logs):
     for path, enough in zip(logs, (True, False), strict=True):
         log = read_log(path)
-        quick = log._replace(**{name: np.repeat(getattr(log, name), 5) for name in Log._fields[:8]}, interval=1.0)
+        quick = log._replace(**{name: np.repeat(getattr(log, name), 5) for name in Log._fields[:9]}, interval=1.0)
         assert (min(measure_excitation(quick, DEFAULT)) > 1.0) is enough
         assert (max(measure_excitation(quick, DEFAULT)) > 1.0) is enough
 
@@ -116,3 +165,5 @@ def test_whiteness_tells_white_from_coloured():
     white[100:150] = np.nan
     assert whiteness(white) > 0.01
     assert whiteness(white[1:] + 0.3 * white[:-1]) < 1e-6
+    ripple = np.sin(2.1 * np.arange(2000))
+    assert coloured(white + ripple) < 0.15 < coloured(white[1:] + 0.3 * white[:-1])

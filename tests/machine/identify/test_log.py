@@ -10,6 +10,7 @@ import pytest
 from cz_gym.errors import CzError
 from cz_gym.machine.identify.log import check_puller, column_map, read_log
 from cz_gym.machine.puller import DEFAULT
+from tests.foreign_puller import ForeignPuller, Operator, drive, write_log
 
 Row = dict[str, str]
 
@@ -65,7 +66,12 @@ def test_gaps_repeats_jitter_and_outliers_are_counted(logs, tmp_path):
     whole, rows = read_log(logs[0]), read(logs[0])
     for k, row in enumerate(rows):
         row["time_s"] = f"{float(row['time_s']) + 0.8 * np.sin(k):.3f}"
-    for at, name, value in ((50, "ring_radius_mm", "150"), (60, "valid", "0"), (70, "T_1_K", "nan")):
+    for at, name, value in (
+        (50, "ring_radius_mm", "150"),
+        (60, "valid", "0"),
+        (70, "T_1_K", "nan"),
+        (90, "T_1_K", "inf"),
+    ):
         rows[at][name] = value
     rows[71]["heater_power_kW"] = ""
     rows[80]["time_s"] = rows[79]["time_s"]
@@ -73,13 +79,15 @@ def test_gaps_repeats_jitter_and_outliers_are_counted(logs, tmp_path):
     assert log.interval == pytest.approx(5.0, abs=0.1)
     assert abs(len(log.time) - len(whole.time)) <= 1
     assert log.notes == (
-        "1 rows repeat a time", "41 rows are missing", "1 gaps are longer than 120 s",
-        "1 readings of the ring are not valid", "1 readings of the ring are outliers",
+        "1 numbers are infinite", "1 rows repeat a time", "41 rows are missing", "1 readings of the ring are not valid",
+        "1 readings of ring_radius_mm are outliers", "2 readings of T_1_K are missing",
+        "1 readings of heater_power_kW are missing", "1 gaps are longer than 20 s",
     )  # fmt: skip
-    assert np.flatnonzero(np.isnan(log.T_1)).tolist() == [70, 80, *range(100, 140)]
+    assert np.flatnonzero(np.isnan(log.T_1)).tolist() == [70, 80, 90, *range(100, 140)]
     assert np.isnan(log.ring[[50, 60, 120]]).all()
     assert np.isfinite([log.v_p, log.Q_H]).all()
-    assert log.Q_H[71] == whole.Q_H[70]
+    assert log.Q_H[71] == pytest.approx((whole.Q_H[70] + whole.Q_H[72]) / 2.0)
+    assert np.flatnonzero(log.unsure[:, 1]).tolist() == [71, 80, *range(100, 140)]
     assert np.flatnonzero(log.gap).tolist() == [140]
 
 
@@ -93,7 +101,12 @@ def changed(name, value, at=400):
         (changed("heater_power_kW", "off"), "row 402: heater_power_kW = 'off' is no number"),
         (changed("time_s", "10"), "row 402: time goes back by 1985 s"),
         (lambda rows: rows[::-1], "row 3: time goes back by 5 s"),
-        (changed("pull_speed_mm_per_min", "", 0), "row 2: pull_speed_mm_per_min is missing"),
+        (lambda rows: [row | {"heater_power_kW": "n/a"} for row in rows], "heater_power_kW is empty"),
+        (lambda rows: [row | {"time_s": f"{1e3 * float(row['time_s']):.0f}"} for row in rows], "time_s=COLUMN:ms"),
+        (lambda rows: [row | {"time_s": row["time_s"][:-1] + "0"} for row in rows[:390]], "195 rows"),
+        (lambda rows: [row | {"time_s": "01.03.2026 12:00:05"} for row in rows], "did you mean time_s=time_s:dmy?"),
+        (lambda rows: [row | {"time_s": "12:00:05"} for row in rows], "did you mean time_s=time_s:clock?"),
+        (lambda rows: [row | {" T_1_K": "1800"} for row in rows], "two columns are called 'T_1_K'"),
         (lambda rows: rows[:300], "300 rows over 24.9 min are too short a log"),
         (lambda rows: [row | {"T_1_K": "1800"} for row in rows], "T_1_K is constant"),
         (lambda rows: [row | {"valid": "0"} for row in rows], "ring_radius_mm has only 0 good readings in 2161 rows"),
@@ -110,6 +123,125 @@ def test_what_is_wrong_is_one_line_with_its_row(change, said, logs, tmp_path):
     assert str(error.value).startswith(f"{tmp_path / 'bad.csv'}: ")
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def stamped(rows, form, start="2026-03-01T12:00:00"):
+    at = datetime.fromisoformat(start)
+    return [row | {"time_s": (at + timedelta(seconds=float(row["time_s"]))).strftime(form)} for row in rows]
+
+
+def german(rows):
+    return [{name: value.replace(".", ",") for name, value in row.items()} for row in rows]
+
+
+def thousands(rows):
+    other = [f"{float(row['T_1_K']):,.6f}".translate(str.maketrans(",.", ".,")) for row in rows]
+    return [row | {"T_1_K": T_1} for row, T_1 in zip(german(rows), other, strict=True)]
+
+
+def inches(rows):
+    return [
+        row
+        | {
+            "ring_radius_mm": f"{float(row['ring_radius_mm']) / 25.4:.10g}",
+            "T_1_K": f"{1.8 * float(row['T_1_K']) - 459.67:.10g}",
+        }
+        for row in rows
+    ]
+
+
+def summer(rows):
+    half = len(rows) // 2
+    return stamped(rows[:half], "%F %T", "2026-10-25T01:29:57.5") + stamped(
+        rows[half:], "%F %T", "2026-10-25T00:29:57.5"
+    )
+
+
+def two_columns(rows):
+    return [
+        {"Date": row["time_s"][:10], "Time": row["time_s"][11:]} | {k: v for k, v in row.items() if k != "time_s"}
+        for row in stamped(rows, "%d.%m.%Y %H:%M:%S", "2026-03-01T23:00:00")
+    ]
+
+
+def spiked(name, value):
+    return lambda rows: [row | {name: value} if k % 400 == 200 else row for k, row in enumerate(rows)]
+
+
+FORMATS = {
+    "dates of Germany (pandas #14367)": (lambda rows: stamped(rows, "%d.%m.%Y %H:%M:%S"), ["time_s=time_s:dmy"], ","),
+    "dates of America": (lambda rows: stamped(rows, "%m/%d/%Y %H:%M:%S"), ["time_s=time_s:mdy"], ","),
+    "time of day over midnight": (
+        lambda rows: stamped(rows, "%H:%M:%S", "2026-03-01T23:00:00"),
+        ["time_s=time_s:clock"],
+        ",",
+    ),
+    "end of summer time (emhass PR 779)": (summer, ["time_s=time_s:iso"], ","),
+    "date beside clock (pangaeapy #58)": (two_columns, ["time_s=Date+Time:dmy"], ","),
+    "milliseconds since 1970 (graph-cli #44)": (
+        lambda rows: [row | {"time_s": str(1772366400000 + round(1e3 * float(row["time_s"])))} for row in rows],
+        ["time_s=time_s:ms"],
+        ",",
+    ),
+    "tabs and decimal comma": (german, [], "\t"),
+    "thousands and decimal comma": (thousands, [], ";"),
+    "inches and degF": (inches, ["ring_radius_mm=ring_radius_mm:in", "T_1_K=T_1_K:degF"], ","),
+    "inf in a column (cta-lstchain PR 429)": (spiked("T_1_K", "-inf"), [], ","),
+    "a pyrometer row 30 K off": (
+        lambda rows: [
+            row | {"T_1_K": f"{float(row['T_1_K']) + 30.0 * (k % 400 == 200)}"} for k, row in enumerate(rows)
+        ],
+        [],
+        ",",
+    ),
+    "pyrometer rows at -9999": (spiked("T_1_K", "-9999"), [], ","),
+    "pyrometer rows at 0 degC": (spiked("T_1_K", "273.15"), [], ","),
+    "heater rows at 0": (spiked("heater_power_kW", "0"), [], ","),
+    "pull rows at 0": (spiked("pull_speed_mm_per_min", "0"), [], ","),
+}
+"""Kinds of logs, with the tracker and number of a public report of the kind."""
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_every_kind_of_table_is_the_same_log(kind, logs, tmp_path):
+    change, columns, separator = FORMATS[kind]
+    mine = read_log(logs[0])
+    other = read_log(write(tmp_path / "log.csv", change(read(logs[0])), separator), column_map(columns))
+    good = np.isfinite(other.T_1) & (other.unsure == 0.0).all(axis=1)
+    spikes = 5 if "row" in kind or "inf" in kind else 0
+    assert (good.sum(), len(good)) == (2161 - spikes, 2161)
+    assert len(other.notes) == (1 if spikes or "summer" in kind else 0)
+    for name in ("time", "ring", "v_p", "Q_H", "T_1"):
+        ours, theirs = (getattr(log, name)[good] for log in (mine, other))
+        np.testing.assert_allclose(theirs, ours, rtol=1e-6, atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("coding", ["latin-1", "utf-16", "utf-8-sig"])
+def test_encodings_titles_units_and_footers_are_passed_over(coding, logs, tmp_path):
+    lines = logs[0].read_text().splitlines()
+    table = [
+        "Öfen; Züge, 3",
+        "Schicht: früh",
+        "",
+        lines[0],
+        "s,mm,mm/min,kW,K,,mm,K",
+        *lines[1:],
+        "Mittelwert,1,2,3,4",
+        "Ende",
+    ]
+    (tmp_path / "log.csv").write_bytes("\n".join(table).encode(coding))
+    mine, other = read_log(logs[0]), read_log(tmp_path / "log.csv")
+    np.testing.assert_array_equal(other.T_1, mine.T_1)
+    assert other.notes == ("3 rows above or below the table have no time",)
+
+
+def test_jitter_is_no_repeat_and_whole_seconds_do_no_harm(tmp_path):
+    puller = ForeignPuller(interval=1.0)
+    rows = drive(puller, Operator(puller).setpoints, hours=0.6)
+    for options in ({"jitter": 0.3}, {"second": 1.0, "jitter": 0.2}):
+        log = read_log(write_log(tmp_path / "log.csv", rows, **options))
+        assert not log.notes
+        np.testing.assert_allclose(log.T_1, [row["T_1_K"] for row in rows])
 
 
 @pytest.mark.parametrize(
