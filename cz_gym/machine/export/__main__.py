@@ -98,14 +98,13 @@ def make_block(name: str, config: Config) -> Block:
     if name in known:
         entry = pkgutil.resolve_name(f"{REGISTRY}:find_controller")(name)
         tuned = f"Settings of scenario {config.scenario.name} ({config.scenario.hash})"
-        tuned = (
-            tuned if config.puller == DEFAULT else "Settings scaled to the puller, or searched for it beside its file"
-        )
+        if config.puller != DEFAULT:
+            tuned = "Settings scaled to the puller, or searched for it beside its file"
         controller = entry.make(config)
         if not (hasattr(controller, "at_rest") and hasattr(controller, "step")):
             raise CzError(f"{name} cannot be exported: it solves an optimisation problem, or has no feedback")
         return Block(
-            identifier, controller, pid, config, (f"Controller {name}: {entry.meaning}.", f"{tuned}. {plant}", found)
+            identifier, controller, pid, config, (f"Controller {name}: {entry.meaning}.", f"{tuned}.", plant, found)
         )
     if name not in agents.shipped_names() and Path(name).suffix != ".onnx":
         raise CzError(unknown("controller or agent", name, [*known, FALLBACK, *agents.shipped_names()]))
@@ -119,7 +118,8 @@ def make_block(name: str, config: Config) -> Block:
     facts = (
         f"Agent {name}: {contract.algorithm}, seed {contract.training_seed}, trained on {contract.scenario} "
         f"({contract.scenario_hash}).",
-        f"File {contract.sha256}; observation {contract.observation} {contract.observation_hash}. {plant}",
+        f"File {contract.sha256}; observation {contract.observation} {contract.observation_hash}.",
+        plant,
         found,
     )
     return Block(identifier, Agent(policy, config), pid, config, facts)

@@ -39,8 +39,6 @@ BLIND = MINUTE
 """Time for which a controller that estimates the temperature keeps the heater without a pyrometer [s]."""
 ASTRAY, FAR = MINUTE, 0.05
 """Time after which a drive counts as not following [s], and its distance from the setpoint in shares of its range."""
-import os
-VARIANT = os.environ.get("VARIANT", "B")
 LEVEL, TRIM_T_1, TRIM_Q_H = 5.0 * MINUTE, 1.5, 0.02
 """Averaging time of the pull speed [s]; what a takeover leaves of the deviation from the nominal temperature [K] and
 power [share of the heater's range]. The rest counts as an error of the nominal values."""
@@ -266,12 +264,11 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
         np.where(fallback, second, first) / unit + at
         for first, second, unit, at in zip(own[:2], other[:2], (MM_PER_MIN, KILO), nominal, strict=True)
     )
-    old = [np.where(runs, _near(each, astray), each.applied) for each in drives]
+    lost = astray > ASTRAY
+    old = [np.where(runs, each.near(each.held, lost), each.applied) for each in drives]
     level = np.where(call.starts, 0.0, memory.level)
     level = level + min(dt / LEVEL, 1.0) * (seen.read.v_p / (drives[0].nominal * MM_PER_MIN) - level)
     blind = ~seen.pyrometer & ((dark > BLIND) | fallback | (not estimates))
-    if VARIANT == "A" and estimates:
-        blind = blind & fallback
     moved = np.where(seen.reference & ~call.starts, seen.read.T_1_ref - memory.readings.T_1_ref, 0.0)
     trim = FOLLOWED * facts.feed * moved + facts.trim * (level - memory.level + dt / facts.slow * level)
     wanted = np.where(fallback & ~seen.ring, old[0], pull), np.where(blind, old[1] + trim / KILO, heater)
@@ -281,7 +278,7 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
         for each, start, target in zip(drives, old, wanted, strict=True)
     ]
     setpoints = [
-        np.where(call.due, np.where(engaged, value, each.applied), each.held)
+        np.where(call.due, np.where(engaged, each.near(value, lost), each.applied), each.held)
         for each, (value, _) in zip(drives, moves, strict=True)
     ]
     bits = {
@@ -289,7 +286,7 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
         Alarm.REFERENCE: ~seen.reference, Alarm.LATE: call.late, Alarm.CLOCK: ~call.sound,
         Alarm.PULL_LIMITED: engaged & moves[0][1], Alarm.HEATER_LIMITED: engaged & moves[1][1],
         Alarm.TAKEOVER: engaged & (share < 1.0), Alarm.FALLBACK: fallback, Alarm.FAILED: engaged & ~sound,
-        Alarm.MANUAL: ~engaged, Alarm.SETTINGS: ~sane, Alarm.ASTRAY: astray > ASTRAY, Alarm.MODEL: puzzled,
+        Alarm.MANUAL: ~engaged, Alarm.SETTINGS: ~sane, Alarm.ASTRAY: lost, Alarm.MODEL: puzzled,
     }  # fmt: skip
     alarms = reduce(add, (np.where(holds, float(bit), 0.0) for bit, holds in bits.items()))
     outputs = dict(zip((port.name for port in OUTPUTS), (*setpoints, alarms), strict=True))
@@ -339,6 +336,10 @@ class Drive(NamedTuple):
         """Whether it is far from its last setpoint."""
         return self.known & (np.abs(self.applied - self.held) > self.far)
 
+    def near(self, setpoint: Any, lost: Any) -> Any:
+        """The setpoint; where the drive does not follow, no farther from it than needed to see that it does again."""
+        return np.where(lost, np.clip(setpoint, self.applied - 2.0 * self.far, self.applied + 2.0 * self.far), setpoint)
+
     def move(self, old: Any, wanted: Any, share: Any, dt: float) -> tuple[Any, Any]:
         """The setpoint on its way from ``old`` to a value, and whether range or slew rate cut it."""
         free, bound = (
@@ -364,12 +365,6 @@ def _drive(sane: Any, facts: Facts, call: Call, seen: Readings, given: Any, memo
     span = given[end.format("min")], given[end.format("max")]
     applied, far = np.where(known, given[reading], held), FAR * (span[1] - span[0])
     return Drive(known, applied, held, nominal, far, given[slew], span)
-
-
-def _near(drive: Drive, astray: Any) -> Any:
-    """Where a setpoint goes on from: from near the drive, if that has not followed it."""
-    near = np.clip(drive.held, drive.applied - 2.0 * drive.far, drive.applied + 2.0 * drive.far)
-    return np.where(astray > ASTRAY, near, drive.held)
 
 
 def _beyond(value: Any, most: float) -> Any:

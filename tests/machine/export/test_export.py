@@ -39,6 +39,20 @@ def block_of(name, scenario="puller"):
     return make_block(name, config_of(scenario))
 
 
+class StBlock:
+    """A block's structured text, for one plant, in the tests' interpreter."""
+
+    def __init__(self, block, single=False):
+        (self.text,) = write_st(block.program, single).values()
+
+    def start(self, n):
+        return FunctionBlock(self.text)
+
+    def run(self, inputs, memory):
+        outputs = memory(**{name: float(np.ravel(value)[0]) for name, value in inputs.items()})
+        return {name: np.full(1, float(value)) for name, value in outputs.items()}, memory
+
+
 class OnnxBlock:
     """A block's ONNX graph in onnxruntime, for one plant."""
 
@@ -71,17 +85,18 @@ def nominal(changed=None):
 
 
 class Plant:
-    """A block, called at times of the test's own."""
+    """A block, called at times of the test's own, in Python or in another language."""
 
-    def __init__(self, name="paper-tuned", **changed):
+    def __init__(self, name="paper-tuned", runner=lambda block: block, **changed):
         self.block, self.changed = block_of(name), changed
-        self.memory = self.block.start(1)
+        self.runner = runner(self.block)
+        self.memory = self.runner.start(1)
         self.time = 0.0
 
     def __call__(self, time=None, **given):
         self.time = self.time + 5.0 if time is None else time
         clock = {"time_s": self.time, "ring_time_s": self.time}
-        outputs, self.memory = self.block.run(nominal(clock | given) | self.changed, self.memory)
+        outputs, self.memory = self.runner.run(nominal(clock | given) | self.changed, self.memory)
         return {name: float(value[0]) for name, value in outputs.items()}
 
     def alarms(self, **given):
@@ -235,8 +250,11 @@ def test_no_reading_brings_a_setpoint_outside_its_limits(name, samples):
     known = {name: port.default for name, port in plant.block.ports.items()}
     for sample in samples:
         outputs = plant(**{"time": plant.time + 5.0} | sample)
-        assert 0.9 <= outputs[PULL] <= 1.4
-        assert known["heater_power_min_kW"] <= outputs[HEATER] <= known["heater_power_max_kW"]
+        applied = [given for each in samples if 0.0 <= (given := each.get("pull_speed_mm_per_min", 1.2)) <= 13.3]
+        assert min([0.9, *applied]) <= outputs[PULL] <= max([1.4, *applied])  # ramps from the drives into the range
+        applied = [given for each in samples if abs(given := each.get("heater_power_kW", 58.0)) <= 160.0]
+        low, high = known["heater_power_min_kW"], known["heater_power_max_kW"]
+        assert min([low, *applied]) <= outputs[HEATER] <= max([high, *applied])
         assert outputs[ALARMS] >= 0
 
 
@@ -294,7 +312,9 @@ def test_the_clock_is_watched_and_no_sample_is_taken_twice():
     assert int(plant(time=np.nan)[ALARMS]) & Alarm.CLOCK
     assert int(plant(time=105.0)[ALARMS]) == 0
     assert int(plant(time=112.0)[ALARMS]) == Alarm.LATE
-    old = plant.alarms(ring_time_s=plant.time - 30.0)
+    assert int(plant()[ALARMS]) == 0
+    old = plant.alarms(ring_time_s=plant.time - 30.0)  # the camera's latency is 5 s
+    assert plant.alarms(ring_time_s=plant.time - 10.0) == 0
     assert old == Alarm.RING
 
 
@@ -311,7 +331,79 @@ def test_ranges_and_slew_rates_hold():
     assert int(outputs[ALARMS]) & Alarm.HEATER_LIMITED
 
 
-@pytest.mark.parametrize(("name", "to", "files"), [("lqg-at-0.02", "c", 3), ("ppo", "st", 2), ("lqg", "onnx", 2)])
+LANGUAGES = [
+    pytest.param(lambda block: block, id="python"),
+    pytest.param(CompiledBlock, id="c", marks=needs_compiler),
+    pytest.param(StBlock, id="st"),
+]
+
+
+@pytest.mark.parametrize("runner", LANGUAGES)
+def test_a_gap_is_a_takeover_from_the_drives_and_ranges_are_reached_by_ramps(runner):
+    """An hour without a call, in which the operator moved the drives; the heater beyond its range."""
+    plant = Plant(
+        "paper-tuned", runner, heater_slew_kW_per_min=1.0, heater_power_max_kW=70.0, pull_slew_mm_per_min2=0.2
+    )
+    for _ in range(30):
+        plant(pull_speed_mm_per_min=0.9)
+    moved = {"pull_speed_mm_per_min": 1.2, "heater_power_kW": 75.0}
+    outputs = plant(time=3600.0, **moved)
+    assert (outputs[PULL], outputs[HEATER]) == (1.2, 75.0)
+    assert int(outputs[ALARMS]) & (Alarm.TAKEOVER | Alarm.FALLBACK | Alarm.LATE) == Alarm.TAKEOVER | Alarm.LATE
+    for _ in range(100):
+        before, outputs = outputs, plant(pull_speed_mm_per_min=outputs[PULL], heater_power_kW=outputs[HEATER])
+        assert abs(outputs[HEATER] - before[HEATER]) <= 1.0 / 12.0 + 1e-9
+        assert abs(outputs[PULL] - before[PULL]) <= 0.2 / 12.0 + 1e-9
+    assert outputs[HEATER] <= 70.0
+    stopped = plant(automatic=0.0, pull_speed_mm_per_min=0.0, heater_power_kW=80.0)
+    assert (stopped[PULL], stopped[HEATER]) == (0.0, 80.0)
+
+
+@pytest.mark.parametrize("runner", LANGUAGES)
+def test_without_drives_the_set_nominal_values_hold_and_wrong_settings_refuse_to_start(runner):
+    gone = {"pull_speed_mm_per_min": np.nan, "heater_power_kW": np.nan}
+    plant = Plant("paper-tuned", runner, nominal_heater_power_kW=56.7)
+    outputs = plant(**gone)
+    assert (outputs[PULL], outputs[HEATER]) == (1.2, 56.7)
+    assert int(outputs[ALARMS]) & (Alarm.MANUAL | Alarm.DRIVES) == Alarm.MANUAL | Alarm.DRIVES
+    assert Alarm.TAKEOVER in plant.alarms(heater_power_kW=57.0)
+    for wrong in (
+        {"nominal_T_1_K": np.nan}, {"pull_slew_mm_per_min2": np.inf}, {"takeover_s": np.nan}, {"gap_s": 0.0},
+        {"pull_speed_min_mm_per_min": 1.5, "pull_speed_max_mm_per_min": 1.0}, {"heater_slew_kW_per_min": -1.0},
+    ):  # fmt: skip
+        outputs = Plant("paper-tuned", runner, **wrong)(pull_speed_mm_per_min=1.3)
+        assert outputs[PULL] == 1.3
+        assert int(outputs[ALARMS]) & (Alarm.SETTINGS | Alarm.MANUAL) == Alarm.SETTINGS | Alarm.MANUAL
+
+
+@pytest.mark.parametrize("runner", LANGUAGES)
+def test_drives_that_do_not_follow_raise_a_bit_and_are_taken_as_applied(runner):
+    plant = Plant("paper-tuned", runner)
+    alarms = [plant.alarms(ring_radius_mm=104.0, pull_speed_mm_per_min=1.2) for _ in range(120)]
+    assert Alarm.ASTRAY not in alarms[10]
+    assert Alarm.ASTRAY in alarms[-1]
+    assert Alarm.FALLBACK not in alarms[-1]
+    assert abs(plant(ring_radius_mm=104.0)[PULL] - 1.2) <= 0.25
+
+
+@pytest.mark.parametrize("runner", LANGUAGES)
+@pytest.mark.parametrize("reading", [np.nan, 0.0, 1806.0, "stuck"])
+def test_without_a_pyrometer_the_heater_holds_and_a_bit_says_so(runner, reading):
+    plant, rng = Plant("paper-tuned", runner), np.random.default_rng(0)
+    T_1 = plant.block.ports["nominal_T_1_K"].default
+    for _ in range(30):
+        before = plant(T_1_K=T_1 + rng.normal(0.0, 0.1))
+    gone = T_1 if reading == "stuck" else reading
+    power = before[HEATER]
+    for k in range(200):
+        outputs = plant(T_1_K=gone, heater_power_kW=power)
+        power = outputs[HEATER]
+        assert bool(int(outputs[ALARMS]) & Alarm.PYROMETER) == (reading != "stuck" or k > 60)
+    assert abs(power - before[HEATER]) < 0.3
+    assert Alarm.PYROMETER not in plant.alarms(T_1_K=T_1 + 0.5)
+
+
+@pytest.mark.parametrize(("name", "to", "files"), [("lqg-at-0.02", "c", 4), ("ppo", "st", 3), ("lqg", "onnx", 3)])
 def test_the_command_writes_a_folder(name, to, files, tmp_path):
     assert main([name, "--to", to, "--out", str(tmp_path)]) == 0
     assert len(list(tmp_path.iterdir())) == files
