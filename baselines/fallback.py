@@ -18,12 +18,15 @@ from scipy.signal import cont2discrete
 from cz_gym.baselines import for_puller
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import close
+from cz_gym.baselines.lqg.designs import MEAN_RIPPLE
 from cz_gym.baselines.pid.compensated_pid import SeriesPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.policy import Floats
+from cz_gym.baselines.tuned_for import with_values
 from cz_gym.body.plant import Puller, make_puller
 from cz_gym.config import Config
 from cz_gym.errors import CzError
+from cz_gym.machine.puller import DEFAULT
 from cz_gym.physics.linearisation import INPUTS, OUTPUTS, STATES, linearise
 from cz_gym.support.units import MM, MM_PER_MIN
 
@@ -79,9 +82,7 @@ def fallback(config: Config) -> Fallback:
         replace(config, scenario=scenarios[0], horizon=config.control_interval),
         max(each.latency for each in sensors),
         min(config.parameters.v_0, *(each.actuators.pull_window for each in scenarios)),
-        max(
-            math.hypot(np.mean(each.camera_noise), for_puller.designs.MEAN_RIPPLE * each.ripple[1]) for each in sensors
-        ),
+        max(math.hypot(np.mean(each.camera_noise), MEAN_RIPPLE * each.ripple[1]) for each in sensors),
     )
 
 
@@ -99,7 +100,7 @@ def _searched(config: Config, latency: float, window: float, noise: float) -> Fa
         candidate = _scaled(start, dict(zip(names, values.tolist(), strict=True)), plant.scale)
         for pid, price, margins in _priced(candidate, config, plant):
             if price < best and _stable(pid, config):
-                best, middle, found = price, values, Fallback(pid, *margins, latency)
+                best, middle, found = price, values, Fallback(pid, margins[0], margins[1], latency)
     if found is None:
         raise CzError(f"no PID keeps margins of {GAIN_MARGIN} and {PHASE_MARGIN} deg on puller {config.puller.label}")
     return found
@@ -114,7 +115,7 @@ def _scaled(start: FilteredPID, values: dict[str, float], scale: dict[str, float
     """The settings with these ones, for the default puller, in proportion to this one."""
     of = {path: scale[name] for name, paths in for_puller.SCALED.items() for path in paths}
     own = {path: of[path] * value for path, value in values.items()}
-    settings: FilteredPID = for_puller.with_values(replace(start, pid=SeriesPID(1.0, N=20.0)), own)
+    settings: FilteredPID = with_values(replace(start, pid=SeriesPID(1.0, N=20.0)), own)
     return settings
 
 
@@ -154,7 +155,7 @@ def _loop(pid: FilteredPID, config: Config, plant: _Plant) -> tuple[Any, Any, An
 def _priced(pid: FilteredPID, config: Config, plant: _Plant) -> Any:
     """The PID with each gain that keeps the margins, its price and its margins."""
     loop, law, load = _loop(pid, config, plant)
-    default = for_puller.DEFAULT.parameters.v_0
+    default = DEFAULT.parameters.v_0
     for gain in (GAINS * plant.scale["gain"]).tolist():
         L, closed = gain * loop, 1.0 / (1.0 + gain * loop)
         up, down, phase = (

@@ -139,7 +139,8 @@ class LQG(MeasuredController):
 
     def puzzled(self, memory: Memory) -> Any:
         """Whether its model does not explain the readings: the innovations have a mean that noise has not."""
-        return (np.abs(memory.filter.surprise) > PUZZLING).any(axis=-1)
+        warmth, width = np.abs(memory.filter.surprise).T
+        return np.maximum(warmth, width) > PUZZLING
 
     def law(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
         """The regulator's inputs [m/s, W], deviations within the drives' range, shape (n, 2).

@@ -418,7 +418,7 @@ class Block:
             name: np.broadcast_to(np.asarray(inputs.get(name, port.default), np.float64), (n,))
             for name, port in self.ports.items()
         }
-        outputs, again = {}, np.ones(n, np.bool_)
+        outputs, again = dict[str, Any](), np.ones(n, np.bool_)
         for _ in range(PASSES):
             with np.errstate(all="ignore"):
                 shown, after, due, more = self._step(given, memory)
