@@ -32,7 +32,9 @@ def memory_of(program: Program, single: bool = False) -> tuple[np.dtype[Any], in
     arrays = [(name, kinds[kind], size) for name, (size, kind) in work.items() if size > 1]
     room: Any = ("work", np.dtype([("unused", "u1"), *arrays], align=True))
     cells: Any = [(cell.name, "f8" if cell.wide else real, cell.start.shape) for cell in program.memory]
-    return np.dtype([*((port.name, "f8") for port in program.settings), *cells, room], align=True), 1024 + 8 * len(work)
+    return np.dtype([*((port.name, "f8") for port in program.settings), *cells, room], align=True), 2048 + 16 * len(
+        work
+    )
 
 
 class CompiledBlock:

@@ -31,7 +31,7 @@ from .ports import INPUTS, OUTPUTS, Alarm, nominal_puller, readings_of, settings
 from .program import PASSES, Port, Program, record
 from .trace import FINITE, Floats
 
-JUMP, MEND = 8.0, 0.05 / MINUTE
+JUMP, MEND = 8.0, 0.02 / MINUTE
 """Largest difference of the pyrometer from what is expected [K], and its growth without a good reading [K/s]."""
 STUCK, SAME = 5.0 * MINUTE, 1e-4
 """Time after which a pyrometer that changes by less than SAME [K] counts as stuck [s]."""
@@ -39,11 +39,11 @@ BLIND = MINUTE
 """Time for which a controller that estimates the temperature keeps the heater without a pyrometer [s]."""
 ASTRAY, FAR = MINUTE, 0.05
 """Time after which a drive counts as not following [s], and its distance from the setpoint in shares of its range."""
-LEVEL, TRIM_T_1, TRIM_Q_H = 5.0 * MINUTE, 1.5, 0.02
+LEVEL, TRIM_T_1, TRIM_Q_H = 5.0 * MINUTE, 0.5, 0.005
 """Averaging time of the pull speed [s]; what a takeover leaves of the deviation from the nominal temperature [K] and
 power [share of the heater's range]. The rest counts as an error of the nominal values."""
 SETTLED = 15.0 * MINUTE
-"""Time after a takeover from which readings that a controller's model does not explain count [s]."""
+"""Time after a takeover, or a bad pyrometer, from which readings that a controller's model does not explain count [s]."""
 SLOWER, FOLLOWED = 1.5, 0.5
 """Of the heater without a pyrometer: the time constant of the mean pull speed, in multiples of its averaging time; the
 share of the recipe's movement that is followed [-]."""
@@ -119,6 +119,8 @@ class Memory(NamedTuple):
     """Time without a good reading of the pyrometer [s]."""
     level: Any
     """Mean pull speed above nominal, relative [-]."""
+    calm: Any
+    """Time since the takeover and since the pyrometer was last bad [s]."""
     off_T_1: Any
     """Error of the nominal temperature [K], as the takeover found it."""
     off_Q_H: Any
@@ -232,8 +234,8 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
     good = seen.ring & seen.reference & known
     bad = np.where(good, 0.0, np.where(call.starts, 0.0, memory.bad) + dt)
     dark = np.where(seen.pyrometer, 0.0, np.where(call.starts, 0.0, memory.dark) + dt)
-    settled = runs & (memory.since > SETTLED)
-    puzzled = settled & (controller.puzzled(memory.controller) if hasattr(controller, "puzzled") else False)
+    calm = np.where(runs & seen.pyrometer, memory.calm + dt, 0.0)
+    puzzled = (calm > SETTLED) & (controller.puzzled(memory.controller) if hasattr(controller, "puzzled") else False)
     fallen = runs & (memory.fallback > 0.5)
     fallback = runs & (fallen | (bad > given["fallback_after_s"]) | puzzled)
     since = np.where(runs & (fallen | ~fallback), memory.since + dt, 0.0)
@@ -305,6 +307,7 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
         still=seen.still,
         dark=dark,
         level=level,
+        calm=calm,
         off_T_1=off_T_1,
         off_Q_H=off_Q_H,
         readings=seen.read._replace(ring_error=read.ring_error),

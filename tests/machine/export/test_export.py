@@ -224,7 +224,7 @@ def test_the_test_vector_is_what_every_language_computes(name, runner):
 
 @pytest.mark.parametrize(
     ("name", "identifier"),
-    [("a*/ int x; /*", "a_int_x"), ("(*) evil__name_", "evil_name"), ("Zähler-Größe", "zahler_groe"), ("µ", "u")],
+    [("a*/ int x; /*", "a_int_x"), ("(*) evil__name_", "evil_name"), ("Zähler-Größe", "zahler_groe"), ("µ", "agent")],
 )
 def test_a_name_becomes_no_code(name, identifier):
     """CasADi 1188 and 1359, rosidl 994, 4diac-forte 17, openplc-editor PR 937."""
@@ -246,12 +246,14 @@ def test_an_lqg_falls_back_when_its_model_does_not_explain_the_readings():
         start = staticmethod(block.start)
 
         def run(self, inputs, memory):
-            return block.run(dict(inputs) | {"ring_radius_mm": 2.0 * nominal_ring - inputs["ring_radius_mm"]}, memory)
+            ring = np.array(inputs["ring_radius_mm"])
+            ring = np.where(inputs["time_s"] > 1800.0, 2.0 * nominal_ring - ring, ring)
+            return block.run(dict(inputs) | {"ring_radius_mm": ring}, memory)
 
     policy, state, seen = BlockPolicy(block, Reversed()), None, Alarm(0)
     env = CzVectorEnv.from_config(replace(block.config, horizon=7200.0), 3)
     observation, _ = env.reset(seed=[1, 2, 3])
-    for _ in range(700):
+    for _ in range(1000):
         action, state = policy.predict(observation, state)
         seen |= Alarm(int(np.bitwise_or.reduce(state.outputs[ALARMS].astype(int))))
         observation, _, over, _, _ = env.step(action)
@@ -302,8 +304,9 @@ def test_a_shadow_runs_beside_a_log(tmp_path):
     record_log(env, make_controller("paper-tuned", env.unwrapped.config), tmp_path / "log.csv", seed=1)
     assert main(["paper-tuned", "--shadow", str(tmp_path / "log.csv"), "--out", str(tmp_path / "shadow")]) == 0
     table = np.genfromtxt(tmp_path / "shadow" / "shadow.csv", delimiter=",", names=True)
-    apart = table[PULL] - table[f"applied_{PULL}"]
-    assert np.sqrt(np.mean(apart[100:] ** 2)) < 0.03  # the controller beside its own loop
+    before, after = table[f"applied_{PULL}"][99:-2], table[f"applied_{PULL}"][100:-1]
+    moves = np.corrcoef(table[PULL][100:-1] - before, after - before)
+    assert moves[0, 1] > 0.7  # the controller beside its own loop, whose drives are slow
     assert "RMS" in (tmp_path / "shadow" / "README.md").read_text()
 
 
