@@ -52,8 +52,9 @@ class LQGDesign:
     is lost (nested saturation, Teel 1992)."""
 
 
-PUZZLING = 0.55
-"""Mean of the innovations over ten minutes, in standard deviations, that no good model has [-]."""
+PUZZLING = 0.7
+"""Mean of the ring's innovations over ten minutes, in standard deviations, that no good model has; of the pyrometer's,
+which may also stick or drift, twice as much [-]."""
 
 
 class Gains(NamedTuple):
@@ -140,7 +141,7 @@ class LQG(MeasuredController):
     def puzzled(self, memory: Memory) -> Any:
         """Whether its model does not explain the readings: the innovations have a mean that noise has not."""
         warmth, width = np.abs(memory.filter.surprise).T
-        return np.maximum(warmth, width) > PUZZLING
+        return np.maximum(0.5 * warmth, width) > PUZZLING
 
     def law(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
         """The regulator's inputs [m/s, W], deviations within the drives' range, shape (n, 2).

@@ -30,7 +30,7 @@ class Alarm(IntFlag):
     RING = 1
     """The ring reading is invalid, too old, or outside its range; the last good one is held."""
     PYROMETER = 2
-    """The pyrometer is outside its range, has jumped, or has not changed for 5 min; the last good reading is held."""
+    """The pyrometer is outside its range, has jumped, or has not changed for 2 min; the last good reading is held."""
     DRIVES = 4
     """An applied drive is no number or outside its range; the last setpoint is held."""
     REFERENCE = 8

@@ -33,7 +33,7 @@ from .trace import FINITE, Floats
 
 JUMP, MEND = 8.0, 0.02 / MINUTE
 """Largest difference of the pyrometer from what is expected [K], and its growth without a good reading [K/s]."""
-STUCK, SAME = 5.0 * MINUTE, 1e-4
+STUCK, SAME = 2.0 * MINUTE, 1e-4
 """Time after which a pyrometer that changes by less than SAME [K] counts as stuck [s]."""
 BLIND = MINUTE
 """Time for which a controller that estimates the temperature keeps the heater without a pyrometer [s]."""
@@ -42,8 +42,8 @@ ASTRAY, FAR = MINUTE, 0.05
 LEVEL, TRIM_T_1, TRIM_Q_H = 5.0 * MINUTE, 0.5, 0.005
 """Averaging time of the pull speed [s]; what a takeover leaves of the deviation from the nominal temperature [K] and
 power [share of the heater's range]. The rest counts as an error of the nominal values."""
-SETTLED = 15.0 * MINUTE
-"""Time after a takeover, or a bad pyrometer, from which readings that a controller's model does not explain count [s]."""
+SETTLED = 30.0 * MINUTE
+"""Time since a takeover or a bad pyrometer, from which it counts that a model does not explain the readings [s]."""
 SLOWER, FOLLOWED = 1.5, 0.5
 """Of the heater without a pyrometer: the time constant of the mean pull speed, in multiples of its averaging time; the
 share of the recipe's movement that is followed [-]."""
