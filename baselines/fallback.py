@@ -42,7 +42,7 @@ MIDDLE = {
 """Where the search begins, for the default puller."""
 GAINS = np.geomspace(3e-4, 8e-3, 20)
 """Gains that it tries with all the rest, for the default puller [1/s]."""
-STEP, STEP_PRICE = 0.02 * MM_PER_MIN, 0.1
+STEP, STEP_PRICE = 0.02 * MM_PER_MIN, 0.01
 """A pull step RMS of the default puller's, and its price."""
 
 
