@@ -25,7 +25,8 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.machine.export.compiled import CompiledBlock
 from cz_gym.machine.export.controllers import make_block
 from cz_gym.machine.export.policy import BlockPolicy, Runner
-from cz_gym.machine.export.shell import Block, in_shares
+from cz_gym.machine.export.ports import in_shares
+from cz_gym.machine.export.shell import Block
 from cz_gym.support.atomic_files import check_writable, write_files
 from cz_gym.support.command_line import OneLineParser
 

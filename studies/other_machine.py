@@ -20,9 +20,9 @@ from cz_gym import Parameters
 from cz_gym.body.plant import Disturbance, Inputs, make_puller, rates
 from cz_gym.config import make_config
 from cz_gym.evaluation.report.tables import markdown
-from cz_gym.machine.export.__main__ import make_block
 from cz_gym.machine.export.compiled import CompiledBlock
-from cz_gym.machine.export.shell import OUTPUTS
+from cz_gym.machine.export.controllers import make_block
+from cz_gym.machine.export.ports import OUTPUTS
 from cz_gym.machine.identify import Identified, identify, read_log
 from cz_gym.machine.identify.estimate import LAGS, PRIOR_SD
 from cz_gym.machine.puller import PullerFile

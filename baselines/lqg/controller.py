@@ -50,6 +50,11 @@ class LQGDesign:
     is lost (nested saturation, Teel 1992)."""
 
 
+PUZZLING = 0.7
+"""Mean of the ring's innovations over ten minutes, in standard deviations, that no good model has; of the pyrometer's,
+which may also stick or drift, twice as much [-]."""
+
+
 class Gains(NamedTuple):
     """Filter and regulator of one puller, or of one puller a slot."""
 
@@ -130,6 +135,11 @@ class LQG(MeasuredController):
         previous = applied + np.where(starts[:, None], 0.0, np.clip(memory.command - applied, -slack, slack))
         inputs = self.law(state.mean, plan, previous)
         return inputs[:, 0], inputs[:, 1], Memory(state, plan, inputs, np.ones(len(inputs)))
+
+    def puzzled(self, memory: Memory) -> Any:
+        """Whether its model does not explain the readings: the innovations have a mean that noise has not."""
+        warmth, width = np.abs(memory.filter.surprise).T
+        return np.maximum(0.5 * warmth, width) > PUZZLING
 
     def law(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
         """The regulator's inputs [m/s, W], deviations within the drives' range, shape (n, 2).

@@ -41,6 +41,12 @@ class FilterState(NamedTuple):
     camera_variance: Floats
     """Estimated variance of the camera's noise [m2], shape (n,)."""
     ripple: RippleSearch
+    surprise: Floats
+    """Running means of the innovations of pyrometer and ring, in standard deviations, shape (n, 2)."""
+
+
+SURPRISE_MEMORY = 10.0 * MINUTE
+"""Averaging time of the surprise [s]."""
 
 
 class PlantFilter(NamedTuple):
@@ -68,7 +74,7 @@ class PlantFilter(NamedTuple):
         if self.ring is not None and self.ring.has_ripple and not self.ring.frequency_known:
             start = _without_ripple(start, np.ones(n, np.bool_))
         search = ring_model.search_at_rest(n, self.ring, self.dt)
-        return FilterState(np.zeros((n, states)), start, np.full(n, self.noise.camera_sd**2), search)
+        return FilterState(np.zeros((n, states)), start, np.full(n, self.noise.camera_sd**2), search, np.zeros((n, 2)))
 
     def step(
         self, state: FilterState, applied: Floats, drift_moved: Floats, seen: Measured, starts: npt.NDArray[np.bool_]
@@ -97,6 +103,7 @@ class PlantFilter(NamedTuple):
         known = np.isfinite(seen.T_1)
         innovation = np.where(known, seen.T_1 - state.mean[:, _PYROMETER], 0.0)
         variance = np.where(known, noise.pyrometer_sd**2, np.inf)
+        warmth = innovation / np.sqrt(kalman.expected_variance(state.covariance, row) + noise.pyrometer_sd**2)
         mean, covariance = kalman.correct(state.mean, state.covariance, row, innovation, variance, gate)
         ring, row = self.expected_frame(mean)
         innovation, valid = seen.ring_error + seen.r_ref - ring, seen.valid > 0.5
@@ -108,7 +115,10 @@ class PlantFilter(NamedTuple):
         )
         variance = np.where(valid, state.camera_variance, np.inf)
         corrected, covariance = kalman.correct(mean, covariance, row, innovation, variance, gate)
-        new = FilterState(self._clipped(corrected), covariance, camera_variance, state.ripple)
+        width = np.where(valid, innovation, 0.0) / np.sqrt(expected + state.camera_variance)
+        newest = np.clip(np.stack([warmth, width], axis=-1), -gate, gate)
+        surprise = state.surprise + min(self.dt / SURPRISE_MEMORY, 1.0) * (newest - state.surprise)
+        new = FilterState(self._clipped(corrected), covariance, camera_variance, state.ripple, surprise)
         if self.ring is None or not state.ripple.spectrum.shape[1]:
             return new
         limit = gate * np.sqrt(expected + state.camera_variance)
@@ -171,7 +181,8 @@ class PlantFilter(NamedTuple):
         covariance[new, RIPPLE_STATES, RIPPLE_STATES] = ring.ripple_sd**2 * np.eye(2)
         least = self.noise.camera_sd_range[0] ** 2
         reduced = np.maximum(state.camera_variance - 0.5 * np.square(ripple).sum(axis=1), least)
-        return FilterState(mean, covariance, np.where(new, reduced, state.camera_variance), search)
+        variance = np.where(new, reduced, state.camera_variance)
+        return state._replace(mean=mean, covariance=covariance, camera_variance=variance, ripple=search)
 
     def _clipped(self, mean: Floats) -> Floats:
         """The estimates, clipped to where the plant's equations are meaningful."""

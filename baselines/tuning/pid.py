@@ -151,6 +151,14 @@ PAPER_TUNED = TunedPID(
     hot_zones=False,  # it loses no more crystals there all the same
     quoted=True,
 )
+CONVENTIONAL = TunedPID(
+    name="pid-conventional",
+    meaning="tuned PID without compensator, crossover below half the right-half-plane zero",
+    start=FilteredPID(compensator=None, T_track=300.0),
+    parameters=LOOP,
+    limits=(calm, below_half_the_zero, insensitive),
+    hot_zones=False,
+)
 PIDS = (
     TunedPID(
         name="paper-filtered",
@@ -162,14 +170,7 @@ PIDS = (
         searched_on_puller=False,
     ),
     PAPER_TUNED,
-    TunedPID(
-        name="pid-conventional",
-        meaning="tuned PID without compensator, crossover below half the right-half-plane zero",
-        start=FilteredPID(compensator=None, T_track=300.0),
-        parameters=LOOP,
-        limits=(calm, below_half_the_zero, insensitive),
-        hot_zones=False,
-    ),
+    CONVENTIONAL,
     TunedPID(
         name="industrial",
         meaning="incremental pull-speed law of a logged puller, with automatic growth control",

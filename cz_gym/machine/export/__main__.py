@@ -7,15 +7,19 @@ from typing import Any
 
 from cz_gym.config import make_config
 from cz_gym.errors import CzError
+from cz_gym.machine.identify.log import read_log
 from cz_gym.observation import CLIP
 from cz_gym.support.atomic_files import write_files
 from cz_gym.support.command_line import OneLineParser, shown
 from cz_gym.support.units import KILO, MM_PER_MIN
 
+from .compiled import memory_of
 from .controllers import make_block
 from .onnx_graph import write_onnx
-from .shell import Alarm, Block
-from .text import fill_template, meanings, write_c, write_st
+from .ports import Alarm, meanings
+from .shell import Block
+from .text import fill_template, write_c, write_st
+from .vector import shadow, test_vector
 
 WRITERS: dict[str, Any] = {"c": write_c, "st": write_st, "onnx": write_onnx}
 
@@ -29,41 +33,54 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("controller", nargs="?", help="a classical controller, a shipped agent, or an agent file (.onnx)")
     add("--plant", action="store_true", help="the puller in place of a controller (--to fmu)")
-    add("--to", choices=("c", "fmu", "onnx", "st"), required=True, help="C99, FMI, ONNX, IEC 61131-3 structured text")
+    add("--to", choices=("c", "fmu", "onnx", "st"), help="C99, FMI, ONNX, IEC 61131-3 structured text")
+    add("--shadow", type=Path, metavar="LOG", help="in place of --to: run the controller beside a log, and report")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
     parser.add_puller("its nominal values, its drives' limits, what is designed for it")
-    add("--scenario", default="puller", metavar="NAME",
-        help="scenario whose tuned settings a controller has, and that a plant begins with (%(default)s)")  # fmt: skip
+    add("--scenario", metavar="NAME",
+        help="scenario whose tuned settings a controller has, or that a plant begins with (puller)")  # fmt: skip
     add("--real", choices=("double", "float"), default="double", help="precision of c and st (%(default)s)")
     return parser.run(_export, arguments, "plant")
 
 
 def _export(given: argparse.Namespace) -> None:
-    if given.plant != (given.to == "fmu") or given.plant == bool(given.controller):
-        raise CzError("name a controller and --to c, st or onnx; or --plant --to fmu")
-    config = make_config(given.scenario, observation="measured", action="direct", puller=given.puller)
+    fmu, asked = given.to == "fmu", bool(given.to) != bool(given.shadow)
+    if not asked or given.plant != fmu or given.plant == bool(given.controller):
+        raise CzError("name a controller and --to c, st or onnx, or --shadow LOG; or --plant --to fmu")
+    if given.scenario and given.puller and not given.plant:
+        raise CzError(
+            "--scenario is for the default puller: a puller file has settings of its own, whatever the scenario"
+        )
+    config = make_config(given.scenario or "puller", observation="measured", action="direct", puller=given.puller)
     if given.plant:
         from .fmu import build_fmu
 
-        print(shown(build_fmu(given.out, given.scenario, config.puller if given.puller else None)))
+        print(shown(build_fmu(given.out, config.scenario.name, config.puller if given.puller else None)))
         return
     block = make_block(given.controller, config)
-    files = WRITERS[given.to](block.program, given.real == "float")
-    files["README.md"] = readme(block, list(files))
+    if given.shadow:
+        files = shadow(block, read_log(given.shadow))
+    else:
+        files = WRITERS[given.to](block.program, given.real == "float") | {"vector.csv": test_vector(block)}
+        files["README.md"] = readme(block, list(files), given.real == "float")
     write_files({given.out / name: text.encode() if isinstance(text, str) else text for name, text in files.items()})
     print(*(shown(given.out / name) for name in files), sep="\n")
 
 
-def readme(block: Block, files: list[str]) -> str:
+def readme(block: Block, files: list[str], single: bool) -> str:
     """The README beside the files."""
+    memory, stack = memory_of(block.program, single)
     kinds = {
         ".h": "declarations", ".c": "the block", ".st": "the function block",
+        ".csv": "a test vector: inputs and outputs of calls one after the other, with the default settings, for a port",
         ".onnx": "the block as a graph in double precision, inputs of shape [1]; the output `next_memory` is the input "
         "`memory` of the next call, which the first call leaves out",
     }  # fmt: skip
     program, config = block.program, block.config
     parts = {
         "files": "\n".join(f"| `{name}` | {kinds[Path(name).suffix]} |" for name in files),
+        "memory": f"{memory.itemsize / 1024:.0f}",
+        "stack": f"{stack / 1024:.0f}",
         "interval": f"{config.control_interval:g}",
         "pull": f"{CLIP * config.parameters.v_0 / MM_PER_MIN:g}",
         "heater": f"{CLIP * config.heater_range / KILO:g}",

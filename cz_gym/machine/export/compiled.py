@@ -14,12 +14,27 @@ import numpy as np
 
 from cz_gym.errors import CzError
 
-from .shell import INPUTS, Block
+from .ports import INPUTS
+from .program import Program
+from .shell import Block
 from .text import write_c
 from .trace import Floats
+from .writer import Writer
 
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
 """Options of the compiler."""
+
+
+def memory_of(program: Program, single: bool = False) -> tuple[np.dtype[Any], int]:
+    """The structure of a block in C, and the most stack [byte] that a call needs."""
+    real = "f4" if single else "f8"
+    work, kinds = Writer(program, "c", single).work, {"b": "u1", "d": "f8", "w": real}
+    arrays = [(name, kinds[kind], size) for name, (size, kind) in work.items() if size > 1]
+    room: Any = ("work", np.dtype([("unused", "u1"), *arrays], align=True))
+    cells: Any = [(cell.name, "f8" if cell.wide else real, cell.start.shape) for cell in program.memory]
+    return np.dtype([*((port.name, "f8") for port in program.settings), *cells, room], align=True), 2048 + 16 * len(
+        work
+    )
 
 
 class CompiledBlock:
@@ -39,13 +54,11 @@ class CompiledBlock:
             library = ctypes.CDLL(f"{folder}/{name}.so")
         self._init, self._step = getattr(library, f"{name}_init"), getattr(library, f"{name}_step")
         self._init.argtypes, self._step.argtypes = [ctypes.c_void_p], [ctypes.c_void_p] * 3
-        real = "f4" if single else "f8"
-        self.settings = {port.name for port in program.settings}
-        cells = [(cell.name, "f8" if cell.wide else real, cell.start.shape) for cell in program.memory]
-        self.memory = np.dtype([*((port.name, "f8") for port in program.settings), *cells], align=True)
+        self.settings, real = {port.name for port in program.settings}, "f4" if single else "f8"
+        self.memory, _ = memory_of(program, single)
         self.measured = np.dtype([(port.name, "i4" if port.logical else "f8") for port in INPUTS], align=True)
-        kinds = [(port.name, "u4" if port.name == "alarms" else real) for port, _ in program.outputs]
-        self.setpoints = np.dtype(kinds, align=True)
+        shown = [(port.name, "u4" if port.name == "alarms" else real) for port, _ in program.outputs]
+        self.setpoints = np.dtype(shown, align=True)
 
     def start(self, n: int) -> Any:
         """The memory of n blocks before their first sample, a structured array of shape (n,)."""

@@ -2,41 +2,54 @@
 
 import pkgutil
 import re
+import unicodedata
 from pathlib import Path
 from typing import Any
 
 from cz_gym.config import Config
 from cz_gym.errors import CzError
+from cz_gym.machine.puller import DEFAULT
 from cz_gym.support.names import unknown
 
 from .agent import Agent
 from .shell import Block
 
-REGISTRY, AGENTS = "cz_gym.baselines.registry", "cz_gym.agents"
-"""Modules that know controllers and agents, looked up by name because this package imports neither."""
-FALLBACK = "paper-tuned"
-"""The PID that takes over."""
+REGISTRY, AGENTS, SEARCH = "cz_gym.baselines.registry", "cz_gym.agents", "cz_gym.baselines.fallback:fallback"
+"""Modules that know controllers and agents, and the search for the PID that takes over, looked up by name because this
+package imports neither."""
+FALLBACK = "fallback"
+"""Name of the PID that takes over, as a controller of its own."""
 
 
 def make_block(name: str, config: Config) -> Block:
-    """A controller or agent in its shell; its fallback is the re-tuned PID of the same settings.
+    """A controller or agent in its shell; its fallback is a PID searched for the puller.
 
     CzError if there is none of that name, if it cannot be exported, or if an agent is of another puller.
     """
     agents: Any = pkgutil.resolve_name(AGENTS)
     known = [entry.name for entry in pkgutil.resolve_name(f"{REGISTRY}:CONTROLLERS") if not entry.bound]
     plant = f"Puller {config.puller.label}; plant {config.plant_hash}; control interval {config.control_interval:g} s."
-    pid = pkgutil.resolve_name(f"{REGISTRY}:make_controller")(FALLBACK, config)
-    identifier = re.sub(r"\W+", "_", Path(name.removesuffix(".onnx")).name.lower())
+    pid, *margins = pkgutil.resolve_name(SEARCH)(config)
+    found = (
+        f"Fallback: PID searched for this puller with the drives and the camera of scenario {config.scenario.name}: "
+        "gain margin {:.3g}, phase margin {:.3g} deg on Models I and II with a latency of {:g} s.".format(*margins)
+    )
+    identifier = identifier_of(Path(name.removesuffix(".onnx")).name)
+    if name == FALLBACK:
+        return Block(identifier, pid, pid, config, (found, plant))
     if name in known:
         entry = pkgutil.resolve_name(f"{REGISTRY}:find_controller")(name)
-        tuned = f"Settings tuned for scenario {config.scenario.name} ({config.scenario.hash}). {plant}"
+        tuned = f"Settings of scenario {config.scenario.name} ({config.scenario.hash})"
+        if config.puller != DEFAULT:
+            tuned = "Settings scaled to the puller, or searched for it beside its file"
         controller = entry.make(config)
         if not (hasattr(controller, "at_rest") and hasattr(controller, "step")):
             raise CzError(f"{name} cannot be exported: it solves an optimisation problem, or has no feedback")
-        return Block(identifier, controller, pid, config, (f"Controller {name}: {entry.meaning}.", tuned))
+        return Block(
+            identifier, controller, pid, config, (f"Controller {name}: {entry.meaning}.", f"{tuned}.", plant, found)
+        )
     if name not in agents.shipped_names() and Path(name).suffix != ".onnx":
-        raise CzError(unknown("controller or agent", name, [*known, *agents.shipped_names()]))
+        raise CzError(unknown("controller or agent", name, [*known, FALLBACK, *agents.shipped_names()]))
     contract = (policy := agents.load(name)).contract
     its, own = (
         f"puller {each.puller}, plant {each.plant}, control interval {each.control_interval:g} s"
@@ -47,6 +60,14 @@ def make_block(name: str, config: Config) -> Block:
     facts = (
         f"Agent {name}: {contract.algorithm}, seed {contract.training_seed}, trained on {contract.scenario} "
         f"({contract.scenario_hash}).",
-        f"File {contract.sha256}; observation {contract.observation} {contract.observation_hash}. {plant}",
+        f"File {contract.sha256}; observation {contract.observation} {contract.observation_hash}.",
+        plant,
+        found,
     )
     return Block(identifier, Agent(policy, config), pid, config, facts)
+
+
+def identifier_of(name: str) -> str:
+    """A name as a part of identifiers: a letter or digit at both ends, no two underscores in a row, ASCII."""
+    plain = unicodedata.normalize("NFKD", name.lower()).encode("ascii", "ignore").decode()
+    return re.sub(r"[^a-z0-9]+", "_", plain).strip("_") or "agent"

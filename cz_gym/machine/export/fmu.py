@@ -20,8 +20,8 @@ from cz_gym.machine.puller import PullerFile, write_puller
 from cz_gym.observation import Measured, decode
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
 
+from .ports import INPUTS, OUTPUTS, in_plant_units, in_shares, nominal_puller
 from .program import Port
-from .shell import INPUTS, OUTPUTS, in_plant_units, in_shares, nominal_puller
 
 SCRIPT = """import ctypes
 

@@ -1,4 +1,4 @@
-"""A recorded program as an ONNX graph in double precision.
+"""A recorded program as an ONNX graph in double precision: a loop over the samples of a call.
 
 Inputs and settings have their names and shape [1]; settings have defaults. ``memory`` is one array, by default that
 before the first sample; ``next_memory`` is given to the next call.
@@ -12,7 +12,7 @@ import numpy as np
 
 from cz_gym.errors import CzError
 
-from .program import Program
+from .program import PASSES, Program
 from .trace import FINITE, FUNCTIONS, Ids, Node
 
 OPSET, IR = 18, 9
@@ -32,14 +32,15 @@ class Writer:
     def __init__(self, program: Program) -> None:
         self.graph, self.nodes, self.constants = program.graph, list[Any](), dict[Any, Any]()
         self.cells = {cell.name for cell in program.memory}
-        self.add("Split", "memory", self.constant(np.array([cell.start.size for cell in program.memory])),
+        self.add("Split", "before", self.constant(np.array([cell.start.size for cell in program.memory])),
                  results=[f"before_{cell.name}" for cell in program.memory], axis=0)  # fmt: skip
         for node in program.nodes:
             self._write(node, [self.argument(ids, node.op in FUNCTIONS) for ids in node.args], self._name(node))
         after = self.add("Concat", *(self.argument(cell.after) for cell in program.memory), axis=0)
-        self.add("Where", self.argument(program.due), after, "memory", results=["next_memory"])
+        self.add("Reshape", self.argument(program.again), self.constant(np.zeros(0, np.int64)), results=["again"])
+        self.add("Where", self.argument(program.due), after, "before", results=["after"])
         for port, ids in program.outputs:
-            self.add("Identity", self.argument(ids), results=[port.name])
+            self.add("Identity", self.argument(ids), results=[f"now_{port.name}"])
 
     def add(self, operator: str, *args: str, results: Any = (), **attributes: Any) -> str:
         """Add a node; returns the name of its result."""
@@ -111,11 +112,24 @@ def write_onnx(program: Program, single: bool = False) -> dict[str, bytes]:
     writer, start = Writer(program), np.concatenate([cell.start for cell in program.memory])
     defaults = {port.name: np.array([port.default]) for port in program.settings} | {"memory": start}
     given = [*map(numbers, (port.name for port in (*program.inputs, *program.settings))), numbers("memory", start.size)]
-    results = [*(numbers(port.name) for port, _ in program.outputs), numbers("next_memory", start.size)]
-    constants = [numpy_helper.from_array(value, name) for name, value in defaults.items()]
-    graph = helper.make_graph(
-        writer.nodes, program.name, given, results, [*constants, *writer.constants.values()], "\n".join(program.notes)
+    shown = [port.name for port, _ in program.outputs]
+    flags = [helper.make_tensor_value_info(name, 9, []) for name in ("go", "again")]
+    own = [helper.make_tensor_value_info("sample", 7, []), flags[0], numbers("before", start.size)]
+    carried = [flags[1], numbers("after", start.size), *(numbers(f"now_{name}") for name in shown)]
+    body = helper.make_graph(
+        writer.nodes,
+        "sample",
+        [*own, *(numbers(f"last_{name}") for name in shown)],
+        carried,
+        [*writer.constants.values()],
     )
+    defaults |= {"samples": np.array(PASSES, np.int64), "first": np.array(True), "none": np.zeros(1)}
+    constants = [numpy_helper.from_array(value, name) for name, value in defaults.items()]
+    results = [numbers("next_memory", start.size), *(numbers(name) for name in shown)]
+    loop = helper.make_node(
+        "Loop", ["samples", "first", "memory", *["none"] * len(shown)], [each.name for each in results], body=body
+    )
+    graph = helper.make_graph([loop], program.name, given, results, constants, "\n".join(program.notes))
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR)
     checker.check_model(model)
     return {f"cz_{program.name}.onnx": model.SerializeToString()}

@@ -12,7 +12,8 @@ import numpy.typing as npt
 from cz_gym.action import MadeFor, mark
 from cz_gym.observation import decode
 
-from .shell import Block, in_plant_units, in_shares, nominal_puller, select
+from .ports import in_plant_units, in_shares, nominal_puller
+from .shell import Block, select
 from .trace import Floats
 
 
@@ -50,11 +51,14 @@ class BlockPolicy:
     block: Block
     runner: Runner | None = None
     """What runs it in place of Python."""
+    interval: float | None = None
+    """Control interval of the environment, if it is another one than the block's [s]."""
 
     @property
     def made_for(self) -> MadeFor:
         """The environment that takes its actions."""
-        return self.block.config.made_for._replace(action=self.action)
+        made_for = self.block.config.made_for
+        return made_for._replace(action=self.action, control_interval=self.interval or made_for.control_interval)
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -75,7 +79,7 @@ class BlockPolicy:
     def inputs(self, rows: Any, samples: Any) -> dict[str, Any]:
         """The block's inputs for observations of shape (n, channels) at those samples of their episodes."""
         config = self.block.config
-        time = samples * config.control_interval
+        time = samples * (self.interval or config.control_interval)
         readings = in_plant_units(decode(rows, *config.ranges), nominal_puller(config))
         return readings | {"time_s": time, "ring_time_s": time, "automatic": 1.0}
 

@@ -11,8 +11,10 @@ import numpy as np
 
 from .trace import BAD, Floats, Graph, Ids, Node
 
-WIDE = ("last_time_s",)
+WIDE = ("clock_s", "called_s")
 """Memory that needs double precision also where the controller computes in single precision, beside sums over time."""
+PASSES = 3
+"""Most samples of one call."""
 CARRY = ("add", "subtract", "negative", "minimum", "maximum", "select", "multiply", "divide")
 """Operations through which a sum over time goes on, products and quotients with a constant."""
 
@@ -52,13 +54,17 @@ class Program:
     memory: tuple[Cell, ...]
     due: Ids
     """Whether the memory changes at this call, one logical element."""
+    again: Ids
+    """Whether another sample of the same call follows, one logical element."""
     notes: tuple[str, ...] = ()
     """Facts for the header of each written file: puller, hashes, scenario."""
 
     @cached_property
     def nodes(self) -> tuple[Node, ...]:
         """The nodes that outputs or memory depend on, in order; without constants."""
-        results = np.concatenate([self.due, *(ids for _, ids in self.outputs), *(cell.after for cell in self.memory)])
+        results = np.concatenate(
+            [self.due, self.again, *(ids for _, ids in self.outputs), *(cell.after for cell in self.memory)]
+        )
         wanted = set(self.graph.owners(results).tolist())
         for at in reversed(range(len(self.graph.nodes))):
             if at in wanted:
@@ -80,13 +86,13 @@ def rebuild(like: Any, leaves: Iterator[Any]) -> Any:
 
 
 def record(
-    step: Callable[[Any, Any], tuple[Any, Any, Any]],
+    step: Callable[[Any, Any], tuple[Any, Any, Any, Any]],
     memory: Any,
     ports: Sequence[tuple[Port, ...]],
     name: str,
     notes: tuple[str, ...],
 ) -> Program:
-    """Record ``step(given, memory) -> outputs, memory, due``; ``memory`` is that before the first sample.
+    """Record ``step(given, memory) -> outputs, memory, due, again``; ``memory`` is that before the first sample.
 
     ``ports`` are settings, inputs and outputs. The first two are passed as one dictionary of traced numbers, and
     outputs are returned as one.
@@ -95,7 +101,7 @@ def record(
     leaves = [(leaf, np.clip(np.asarray(value, np.float64), -BAD, BAD)) for leaf, value in flatten(memory)]
     cells: list[Any] = [graph.input(leaf, value.shape) if value.size else value for leaf, value in leaves]
     given = {port.name: graph.input(port.name) for port in (*settings, *inputs)}
-    results, after, due = step(given, rebuild(memory, iter(cells)))
+    results, after, due, again = step(given, rebuild(memory, iter(cells)))
 
     def ids_of(value: Any) -> Ids:
         return graph.lift(value).ids.ravel()
@@ -108,7 +114,7 @@ def record(
             wide = leaf in WIDE or _widen(graph, sources, cell.ids, ids_of(new))
             held.append(Cell(leaf, value.ravel(), ids_of(new), wide))
     shown = tuple((port, ids_of(results[port.name])) for port in outputs)
-    return Program(name, graph, settings, inputs, shown, tuple(held), ids_of(due), notes)
+    return Program(name, graph, settings, inputs, shown, tuple(held), ids_of(due), ids_of(again), notes)
 
 
 def _sources(graph: Graph, node: Node) -> set[int]:

@@ -180,12 +180,18 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
         raise AttributeError(name)
 
     def any(self, axis: Any = None) -> bool:
-        """True: every masked step is recorded."""
-        return True
+        """True: every masked step is recorded. Not a number of the record: CzError along an axis."""
+        return self._shortcut(axis, True)
 
     def all(self, axis: Any = None) -> bool:
-        """False: no step is left out."""
-        return False
+        """False: no step is left out. CzError along an axis."""
+        return self._shortcut(axis, False)
+
+    @staticmethod
+    def _shortcut(axis: Any, answer: bool) -> bool:
+        if axis is not None:
+            raise CzError("cannot record any() or all() along an axis: write np.maximum or np.minimum")
+        return answer
 
     def astype(self, dtype: Any) -> Traced:
         """The numbers 0 and 1 of logical elements."""

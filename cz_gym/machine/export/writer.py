@@ -24,7 +24,7 @@ SYNTAX = {
     "multiply": ("({0} * {1})", "({0} * {1})"),
     "divide": ("({0} / {1})", "({0} / {1})"),
     "negative": ("(-{0})", "(-{0})"),
-    "absolute": ("fabs({0})", "ABS({0})"),
+    "absolute": ("fabs{f}({0})", "ABS({0})"),
     "sqrt": ("sqrt{f}({0})", "SQRT({0})"),
     "exp": ("exp{f}({0})", "EXP({0})"),
     "log": ("log{f}({0})", "LN({0})"),
@@ -40,11 +40,14 @@ SYNTAX = {
     "or": ("({0} || {1})", "({0} OR {1})"),
     "not": ("(!{0})", "(NOT {0})"),
     "select": ("({0} ? {1} : {2})", "SEL({0}, {2}, {1})"),
-    "finite": ("(fabs({0}) <= 1e38)", "(ABS({0}) <= 1.0E38)"),
-    "real": ("({0} ? 1.0 : 0.0)", "SEL({0}, 0.0, 1.0)"),
+    "finite": ("(fabs{f}({0}) <= 1e38{f})", "(ABS({0}) <= 1.0E38)"),
+    "real": ("({0} ? 1.0{f} : 0.0{f})", "SEL({0}, 0.0, 1.0)"),
     "number": ("{0}{f}", "{0}"),
     "false": ("0", "FALSE"),
     "true": ("1", "TRUE"),
+    "to d": ("(double){0}", "REAL_TO_LREAL({0})"),
+    "to w": ("(float){0}", "LREAL_TO_REAL({0})"),
+    "count": ("({real}){0}", "DINT_TO_{real}({0})"),
     "index": ("(int)({0})", "{real}_TO_DINT({0})"),
     "bits": ("(unsigned)({0})", "{real}_TO_UDINT({0})"),
     "memory": ("block->{0}", "{0}"),
@@ -55,11 +58,11 @@ SYNTAX = {
     "end loop": ("}}", "END_FOR;"),
     "if": ("if ({0}) {{", "IF {0} THEN"),
     "end if": ("}}", "END_IF;"),
-    "type of reading": ("double", "{real}"),
+    "type of reading": ("double", "LREAL"),
     "type of switch": ("int", "BOOL"),
     "type of alarms": ("unsigned", "UDINT"),
     "type of b": ("unsigned char", "BOOL"),
-    "type of d": ("double", "{real}"),
+    "type of d": ("double", "LREAL"),
     "type of w": ("{block}_real", "{real}"),
     "type of real": ("{real}", "{real}"),
     "declare input": ("{type} {name}; /* {meaning} */", "{name} : {type} := {start}; (* {meaning} *)"),
@@ -75,6 +78,7 @@ SYNTAX = {
         "    {name} : ARRAY [0..{last}] OF {type} := [\n{rows}\n    ];",
     ),
     "tables": ("{0}", "VAR CONSTANT\n{0}\nEND_VAR"),
+    "place": ("{1} *const {0} = block->work.{0};", ""),
     "bit": ("#define {BLOCK}_{0} {1}u /* {2} */", "{1}: {2}"),
 }
 """How C99 and structured text write operations, statements and declarations.
@@ -118,19 +122,20 @@ class Writer:
     """The statements of a program in a dialect, with the work arrays and the constants that they need."""
 
     def __init__(self, program: Program, language: str, single: bool) -> None:
-        """The language is "c" or "st"; C in single precision has sums over time in double precision."""
+        """The language is "c" or "st"; in single precision, readings, settings and sums over time stay in double."""
         self.program, self.graph, block = program, program.graph, f"cz_{program.name}"
-        self.dialects = Dialect(language, block, single), Dialect(language, block, single and language == "st")
-        self.dialect = self.dialects[False]
-        self.cells = {cell.name for cell in program.memory}
-        self.own = self.cells | {port.name for port in program.settings}
+        self.dialects = Dialect(language, block, single), Dialect(language, block, False)
+        self.dialect, self.single = self.dialects[False], single
+        self.cells = {cell.name: "d" if cell.wide else "w" for cell in program.memory}
+        self.own = self.cells.keys() | {port.name for port in program.settings}
         self.switches = {port.name for port in program.inputs if port.logical}
         self.tables: dict[tuple[bytes, str, bool], tuple[str, Floats, bool]] = {}
         """Name and numbers of each table of constants, and whether they are in double precision."""
         self._statements: list[tuple[list[str], int]] = []
         """Lines in which work arrays stand as ``<number>``; the number of the array that they fill, or -1."""
         self._kinds: dict[int, tuple[int, str]] = {}
-        self._inlined: dict[int, str] = {}
+        self._inlined: dict[int, tuple[str, str]] = {}
+        """Expressions that stand in others, and their kinds."""
         self._names: dict[int, str] = {}
         self._copies: dict[bytes, int] = {}
         self._uses: Counter[int] = Counter()
@@ -139,7 +144,8 @@ class Writer:
             for ids in node.args:
                 self._uses.update(self._owners(ids))
                 self._users.update(dict.fromkeys(self._owners(ids), (node, ids)))
-        for ids in (*(ids for _, ids in program.outputs), *(cell.after for cell in program.memory), program.due):
+        results = (*(ids for _, ids in program.outputs), *(cell.after for cell in program.memory))
+        for ids in (*results, program.due, program.again):
             self._uses.update(2 * self._owners(ids))
         for node in program.nodes:
             self._node(node)
@@ -175,9 +181,25 @@ class Writer:
         owners: list[int] = np.unique(self.graph.owners(ids)).tolist()
         return owners
 
-    def _add(self, lines: list[str], size: int, node: Node) -> int:
-        """A new work array of the node's kind, which these lines fill; its number."""
-        self._kinds[len(self._kinds)] = size, "b" if node.logical else "d" if node.wide else "w"
+    def _kind(self, ids: Ids) -> str:
+        """Kind of some elements: "b" for logical ones, "d" for double precision, "w" for the controller's own, "" for
+        constants."""
+        owners = [at for at in self._owners(ids) if self.graph.nodes[at].op != "constant"]
+        kinds = {self._inlined[at][1] if at in self._inlined else self._stored(self.graph.nodes[at]) for at in owners}
+        return max(kinds - {"w"}, default="w" if kinds else "")
+
+    def _stored(self, node: Node) -> str:
+        if node.op == "input":
+            return "w" if node.data in self.switches else self.cells.get(node.data, "d")
+        return "b" if node.logical else "d" if node.wide else "w"
+
+    def _as(self, kind: str, text: str, of: str) -> str:
+        """An expression of one kind as one of another."""
+        return self.dialect(f"to {kind}", text) if self.single and {kind, of} == {"d", "w"} else text
+
+    def _add(self, lines: list[str], size: int, kind: str) -> int:
+        """A new work array of a kind, which these lines fill; its number."""
+        self._kinds[len(self._kinds)] = size, kind
         self._statements.append((lines, len(self._kinds) - 1))
         return len(self._kinds) - 1
 
@@ -187,36 +209,48 @@ class Writer:
             name = self.dialect("memory" if node.data in self.own else "reading", node.data)
             self._names[at] = self.dialect("real", name) if node.data in self.switches else name
             return
+        kind = self._stored(node)
         if node.op in FUNCTIONS:
-            text = self.dialect(node.op, *map(self._element, node.args))
+            result, text = self._expression(node)
             if self._uses[at] == 1 and len(text) <= LONGEST:
                 user, used = self._users[at]
                 if user.op in FUNCTIONS and np.array_equal(used, node.start + np.arange(node.size)):
-                    self._inlined[at] = text
+                    self._inlined[at] = text, result
                     return
-            lines = self.each("<new>", node.size, text)
+            lines = self.each("<new>", node.size, self._as(kind, text, result))
         elif node.op == "matmul":
             lines = self._product(node)
         elif node.op == "argmax":
             row, best = self._array(node.args[0]), self.dialect("index", "<new>")
             larger = f"{row.format(best)} < {row.format('i')}"
-            body = self.dialect.around([self.assign("<new>", "i")], "if", larger)
+            body = self.dialect.around([self.assign("<new>", self.dialect("count", "i"))], "if", larger)
             lines = [self.assign("<new>", self.dialect.number(0.0)), *self.loop("i", node.args[0].size, body)]
         else:
-            picked = self._array(node.args[0]).format(self.dialect("index", self._element(node.args[1])))
-            lines = self.each("<new>", node.size, picked)
-        self._names[at] = f"<{self._add(lines, node.size, node)}>"
+            picked = self._array(node.args[0]).format(self.dialect("index", self._element(node.args[1], "")))
+            lines = self.each("<new>", node.size, self._as(kind, picked, self._kind(node.args[0])))
+        self._names[at] = f"<{self._add(lines, node.size, kind)}>"
+
+    def _expression(self, node: Node) -> tuple[str, str]:
+        """The kind and the text of an operation on single numbers: in double precision if an argument is."""
+        kind = max("d" if node.wide else "w", *({self._kind(ids) for ids in node.args} - {"b"}), key="w d".find)
+        kind = "d" if kind == "d" else "w"
+        self.dialect = self.dialects[kind == "d"]
+        text = self.dialect(node.op, *(self._element(ids, kind) for ids in node.args))
+        self.dialect = self.dialects[node.wide]
+        return ("b" if node.logical else kind), text
 
     def _product(self, node: Node) -> list[str]:
         m, k, n = node.data
+        self.dialect = self.dialects[False]
         a, b = self._array(node.args[0]), self._array(node.args[1])
-        left = a.format(plus("" if m == 1 else f"{k} * i", "l"))
+        left = self._as("w", a.format(plus("" if m == 1 else f"{k} * i", "l")), self._kind(node.args[0]))
         right = b.format(plus("l" if n == 1 else f"{n} * l", "" if n == 1 else "j"))
+        right = self._as("w", right, self._kind(node.args[1]))
         at = plus("" if m == 1 else f"{n} * i", "" if n == 1 else "j")
         lines = [
             self.assign("sum", self.dialect.number(0.0)),
             *self.loop("l", k, [self.assign("sum", f"sum + {left} * {right}")]),
-            self.assign(f"<new>[{at}]" if at else "<new>", "sum"),
+            self.assign(f"<new>[{at}]" if at else "<new>", self._as(self._stored(node), "sum", "w")),
         ]
         lines = self.loop("j", n, lines) if n > 1 else lines
         return self.loop("i", m, lines) if m > 1 else lines
@@ -236,8 +270,8 @@ class Writer:
         moved = "" if step == 0 else "{}" if step == 1 else f"{step} * ({{}})"
         return f"{self._names[owners[0]]}[{plus(moved, str(first) if first or not moved else '')}]"
 
-    def _element(self, ids: Ids) -> str:
-        """Text of element ``i`` of an argument."""
+    def _element(self, ids: Ids, kind: str) -> str:
+        """Text of element ``i`` of an argument, as one of a kind if there is one."""
         known = self.graph.values(ids)
         if known is not None and (known.ravel() == known.flat[0]).all():
             value = known.flat[0]
@@ -245,7 +279,8 @@ class Writer:
                 return self.dialect("true" if value else "false")
             return f"({self.dialect.number(value)})" if value < 0 else self.dialect.number(value)
         owner = int(self.graph.owners(ids[0]))
-        return self._inlined[owner] if owner in self._inlined else self._array(ids).format("i")
+        text = self._inlined[owner][0] if owner in self._inlined else self._array(ids).format("i")
+        return self._as(kind, text, self._kind(ids))
 
     def _table(self, values: Floats) -> str:
         wide = self.dialect is self.dialects[True]
@@ -257,9 +292,9 @@ class Writer:
         """Work array that holds these elements next to each other."""
         key = ids.tobytes()
         if key not in self._copies:
-            pieces = runs(ids, self.graph.owners(ids))
-            lines = self.fill("<new>", pieces, lambda first, last: self._element(ids[first:last]))
-            self._copies[key] = self._add(lines, ids.size, self.graph.owner(int(ids[0])))
+            pieces, kind = runs(ids, self.graph.owners(ids)), self._kind(ids)
+            lines = self.fill("<new>", pieces, lambda first, last: self._element(ids[first:last], kind))
+            self._copies[key] = self._add(lines, ids.size, kind)
         return self._copies[key]
 
     def _finish(self) -> None:
@@ -271,14 +306,17 @@ class Writer:
             if old and old[0].data == cell.name and np.array_equal(cell.after, old[0].start + np.arange(size)):
                 continue
             self.dialect = self.dialects[cell.wide]
-            held = f"<{self._copy(cell.after)}>" + "[i]" * (size > 1) if old else self._element(cell.after)
+            kind = self.cells[cell.name]
+            held = f"<{self._copy(cell.after)}>" + "[i]" * (size > 1) if old else self._element(cell.after, kind)
+            held = self._as(kind, held, self._kind(cell.after)) if old else held
             changes += self.each(self.dialect("memory", cell.name), size, held)
         for port, ids in self.program.outputs:
-            value = self._element(ids)
+            value = self._element(ids, "w")
             value = self.dialect("bits", value) if port.name == "alarms" else value
             self._statements.append(([self.assign(self.dialect("setpoint", port.name), value)], -1))
-        due = self._element(self.program.due)
-        self._statements.append((self.dialect.around(changes, "if", due), -1))
+        self.dialect = self.dialects[False]
+        self._statements.append(([self.assign("again", self._element(self.program.again, ""))], -1))
+        self._statements.append((self.dialect.around(changes, "if", self._element(self.program.due, "")), -1))
 
     def _allocated(self) -> tuple[dict[str, tuple[int, str]], list[str]]:
         """Work arrays by name, and the lines with their names; an array is used again after its last use.

@@ -14,7 +14,7 @@ from cz_gym.config import Config
 from cz_gym.env import CzEnv
 from cz_gym.errors import CzError
 from cz_gym.machine.export.controllers import FALLBACK, make_block
-from cz_gym.machine.export.shell import INPUTS, OUTPUTS, in_plant_units, settings_of
+from cz_gym.machine.export.ports import INPUTS, OUTPUTS, in_plant_units, settings_of
 from cz_gym.observation import CLIP, Measured, decode
 from cz_gym.rendering.canvas import Frame
 from cz_gym.rendering.view import record_of

@@ -8,7 +8,7 @@ FUNCTIONS: dict[str, Any] = {
     "ABS": abs, "SQRT": math.sqrt, "EXP": math.exp, "LN": math.log, "SIN": math.sin, "COS": math.cos,
     "MIN": lambda a, b: b if b < a else a, "MAX": lambda a, b: b if b > a else a,
     "LIMIT": lambda low, x, high: min(max(low, x), high), "SEL": lambda which, no, yes: yes if which else no,
-    "LREAL_TO_DINT": round, "LREAL_TO_UDINT": round, "TRUE": True, "FALSE": False,
+    "LREAL_TO_DINT": round, "LREAL_TO_UDINT": round, "DINT_TO_LREAL": float, "TRUE": True, "FALSE": False,
 }  # fmt: skip
 WORDS = {"AND": "and", "OR": "or", "NOT": "not", "MOD": "%", "=": "=="}
 

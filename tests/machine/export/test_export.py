@@ -3,8 +3,10 @@
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from functools import cache
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -15,15 +17,19 @@ from cz_gym.action import HEATER_RANGE, drives_of
 from cz_gym.baselines.registry import make_controller
 from cz_gym.config import make_config
 from cz_gym.machine.export.__main__ import main
-from cz_gym.machine.export.compiled import CompiledBlock
-from cz_gym.machine.export.controllers import make_block
+from cz_gym.machine.export.compiled import CompiledBlock, memory_of
+from cz_gym.machine.export.controllers import identifier_of, make_block
 from cz_gym.machine.export.onnx_graph import write_onnx
 from cz_gym.machine.export.policy import BlockPolicy
-from cz_gym.machine.export.shell import INPUTS, Alarm, in_shares
+from cz_gym.machine.export.ports import INPUTS, Alarm, in_shares
 from cz_gym.machine.export.text import write_c, write_st
+from cz_gym.machine.export.vector import test_vector as vector_of
+from cz_gym.machine.identify.log import record_log
 from cz_gym.observation import decode, readable
 from cz_gym.vector import CzVectorEnv
 from studies.export import LARGEST, report, study
+from studies.faults import FAULTS, grow
+from tests.foreign_puller import ForeignPuller
 from tests.machine.export.structured_text import FunctionBlock
 
 CONTROLLERS = ("paper", "paper-tuned", "industrial", "lqg", "gradient", "ppo")
@@ -38,6 +44,20 @@ def config_of(scenario, **changed):
 @cache
 def block_of(name, scenario="puller"):
     return make_block(name, config_of(scenario))
+
+
+class StBlock:
+    """A block's structured text, for one plant, in the tests' interpreter."""
+
+    def __init__(self, block, single=False):
+        (self.text,) = write_st(block.program, single).values()
+
+    def start(self, n):
+        return FunctionBlock(self.text)
+
+    def run(self, inputs, memory):
+        outputs = memory(**{name: float(np.ravel(value)[0]) for name, value in inputs.items()})
+        return {name: np.full(1, float(value)) for name, value in outputs.items()}, memory
 
 
 class OnnxBlock:
@@ -60,6 +80,13 @@ class OnnxBlock:
         return found, {"memory": found.pop("next_memory")}
 
 
+LANGUAGES = [
+    pytest.param(lambda block: block, id="python"),
+    pytest.param(CompiledBlock, id="c", marks=needs_compiler),
+    pytest.param(StBlock, id="st"),
+]
+
+
 def nominal(changed=None):
     """Inputs at the operating point."""
     known = {name: port.default for name, port in block_of("paper").ports.items()}
@@ -72,17 +99,18 @@ def nominal(changed=None):
 
 
 class Plant:
-    """A block, called at times of the test's own."""
+    """A block, called at times of the test's own, in Python or in another language."""
 
-    def __init__(self, name="paper-tuned", **changed):
+    def __init__(self, name="paper-tuned", runner=lambda block: block, **changed):
         self.block, self.changed = block_of(name), changed
-        self.memory = self.block.start(1)
+        self.runner = runner(self.block)
+        self.memory = self.runner.start(1)
         self.time = 0.0
 
     def __call__(self, time=None, **given):
         self.time = self.time + 5.0 if time is None else time
         clock = {"time_s": self.time, "ring_time_s": self.time}
-        outputs, self.memory = self.block.run(nominal(clock | given) | self.changed, self.memory)
+        outputs, self.memory = self.runner.run(nominal(clock | given) | self.changed, self.memory)
         return {name: float(value[0]) for name, value in outputs.items()}
 
     def alarms(self, **given):
@@ -109,7 +137,8 @@ def test_a_block_computes_what_the_controller_computes(name, scenario):
         outputs, memory = block.run(inputs | {"takeover_s": 0.0}, memory)
         if k:
             own = np.stack([pull / config.parameters.v_0, heat / HEATER_RANGE], axis=-1)
-            assert in_shares(outputs, config) == pytest.approx(np.clip(own, -1.0, 1.0), abs=1e-9)
+            follows = outputs[ALARMS].astype(int) & Alarm.ASTRAY == 0
+            assert in_shares(outputs, config)[follows] == pytest.approx(np.clip(own, -1.0, 1.0)[follows], abs=1e-9)
         observation, *_ = env.step(policy.action_of(outputs))
 
 
@@ -159,6 +188,127 @@ def test_c_and_onnx_act_as_python_does(name, scenario):
             assert in_shares(found, block.config) == pytest.approx(in_shares(own, block.config), abs=tolerance)
         assert rest[0][ALARMS] == rest[1][ALARMS] == own[ALARMS]
         observation, *_ = env.step(done[0][0])
+
+
+@needs_compiler
+@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize("name", ["paper-tuned", pytest.param("lqg", marks=pytest.mark.slow)])
+def test_the_c_compiles_under_strict_options_with_little_stack_and_its_header_in_cpp(name, single, tmp_path):
+    block = block_of(name)
+    for file, text in write_c(block.program, single).items():
+        (tmp_path / file).write_text(text)
+    strict = "-std=c99 -pedantic -Wall -Wextra -Wconversion -Wdouble-promotion -Werror -O2 -fstack-usage -c"
+    subprocess.run(["gcc", *strict.split(), f"cz_{block.name}.c"], cwd=tmp_path, check=True)
+    stack = [int(line.split("\t")[1]) for line in (tmp_path / f"cz_{block.name}.su").read_text().splitlines()]
+    assert max(stack) <= memory_of(block.program, single)[1]
+    call = f'#include "cz_{block.name}.h"\nint main() {{ static cz_{block.name} b; cz_{block.name}_init(&b); }}'
+    (tmp_path / "main.cpp").write_text(call)
+    subprocess.run(["g++", "-Wall", "-Werror", "main.cpp", f"cz_{block.name}.o", "-o", "m"], cwd=tmp_path, check=True)
+
+
+@pytest.mark.parametrize("runner", [*LANGUAGES[1:], pytest.param(OnnxBlock, id="onnx")])
+@pytest.mark.parametrize("name", ["paper-tuned", pytest.param("lqg", marks=pytest.mark.slow)])
+def test_the_test_vector_is_what_every_language_computes(name, runner):
+    """Late calls, a gap, bad readings and the fallback among them."""
+    block = block_of(name)
+    head, *rows = (line.split(",") for line in vector_of(block).splitlines())
+    other, alarms = runner(block), 0
+    memory = other.start(1)
+    for row in rows:
+        given = dict(zip(head, map(float, row), strict=True))
+        expected = [given.pop(name) for name in (PULL, HEATER, ALARMS)]
+        outputs, memory = other.run(given, memory)
+        assert [float(outputs[name][0]) for name in (PULL, HEATER, ALARMS)] == pytest.approx(expected, abs=1e-9)
+        alarms |= int(expected[2])
+    assert Alarm.LATE | Alarm.FALLBACK | Alarm.PYROMETER | Alarm.RING | Alarm.TAKEOVER | Alarm.MANUAL in Alarm(alarms)
+
+
+@pytest.mark.parametrize(
+    ("name", "identifier"),
+    [("a*/ int x; /*", "a_int_x"), ("(*) evil__name_", "evil_name"), ("Zähler-Größe", "zahler_groe"), ("µ", "agent")],
+)
+def test_a_name_becomes_no_code(name, identifier):
+    """CasADi 1188 and 1359, rosidl 994, 4diac-forte 17, openplc-editor PR 937."""
+    assert identifier_of(name) == identifier
+    block = replace(block_of("paper-tuned"), name=identifier_of(name), notes=(f"Agent {name}: \\ ??/ ä",))
+    for text in (*write_c(block.program).values(), *write_st(block.program).values()):
+        assert text.isascii()
+        opened = re.findall(r"/\*|\*/|\(\*|\*\)", text)
+        ends = {"/*": "*/", "(*": "*)"}
+        assert all(ends[a] == b for a, b in zip(opened[::2], opened[1::2], strict=True))
+
+
+def test_an_lqg_falls_back_when_its_model_does_not_explain_the_readings():
+    """The ring's error with the wrong sign: a controller that stays at its limit without an alarm."""
+    block = block_of("lqg-at-0.02")
+    nominal_ring = sum(block.ports[name].default for name in ("nominal_radius_mm", "ring_bias_mm"))
+
+    class Reversed:
+        start = staticmethod(block.start)
+
+        def run(self, inputs, memory):
+            ring = np.array(inputs["ring_radius_mm"])
+            ring = np.where(inputs["time_s"] > 2400.0, 2.0 * nominal_ring - ring, ring)
+            return block.run(dict(inputs) | {"ring_radius_mm": ring}, memory)
+
+    policy, state, seen = BlockPolicy(block, Reversed()), None, Alarm(0)
+    env = CzVectorEnv.from_config(replace(block.config, horizon=7200.0), 3)
+    observation, _ = env.reset(seed=[1, 2, 3])
+    for _ in range(1300):
+        action, state = policy.predict(observation, state)
+        seen |= Alarm(int(np.bitwise_or.reduce(state.outputs[ALARMS].astype(int))))
+        observation, _, over, _, _ = env.step(action)
+        if over.any():
+            break
+    assert Alarm.MODEL | Alarm.FALLBACK in seen
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_the_compiled_block_drives_a_simulator_that_is_not_ours():
+    """Lags and faults of a foreign puller: heater lag and dead time, pyrometer filter, latency, uneven calls."""
+    machine = ForeignPuller(
+        seed=1, interval=1.0, heater_lag=10.0, heater_dead_time=5.0, pyrometer_filter=20.0, camera_latency=4.0,
+        camera_noise=0.05, heater_slew=1000.0 / 60.0, heater_step=50.0, pull_slew=0.2 / 60.0, pull_window=0.3,
+    )  # fmt: skip
+    block = block_of("lqg-at-0.02")
+    known = {
+        "nominal_radius_mm": 100.0, "ring_bias_mm": machine.ring_bias * 1e3, "nominal_T_1_K": machine.T_1_0,
+        "nominal_heater_power_kW": machine.power_0 / 1e3, "nominal_pull_speed_mm_per_min": 0.9,
+    }  # fmt: skip
+    limits = {"pull_speed_min_mm_per_min": 0.6, "pull_speed_max_mm_per_min": 1.2, "pull_slew_mm_per_min2": 0.2}
+    limits |= {"heater_power_min_kW": machine.power_0 / 1e3 - 10.0, "heater_power_max_kW": machine.power_0 / 1e3 + 10.0}
+    runner, rng, due = CompiledBlock(block), np.random.default_rng(0), 0.0
+    memory, seen = runner.start(1), machine.readings()
+    for k in range(10800):
+        if k >= due:
+            due = k + rng.integers(3, 11)
+            given = seen | {"T_1_K": np.nan} if 5000 <= k < 6800 else seen
+            outputs, memory = runner.run(given | known | limits | {"automatic": 1.0}, memory)
+        seen = machine.step({name: float(outputs[name][0]) for name in (PULL, HEATER)})
+        assert not machine.lost, k
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", [name for name in FAULTS if name != "none"])
+def test_faults_lose_no_crystal(fault):
+    """On few crystals; ``python -m studies.faults`` has a hundred."""
+    block = block_of("paper-tuned")
+    assert grow(block, fault, 2, CompiledBlock(block), 7200.0).lost == 0
+
+
+def test_a_shadow_runs_beside_a_log(tmp_path):
+    env = gym.make(
+        "cz_gym:Cz-v0", scenario="puller", observation="measured", action="direct", info="all", horizon=3600.0
+    )
+    record_log(env, make_controller("paper-tuned", env.unwrapped.config), tmp_path / "log.csv", seed=1)
+    assert main(["paper-tuned", "--shadow", str(tmp_path / "log.csv"), "--out", str(tmp_path / "shadow")]) == 0
+    table = np.genfromtxt(tmp_path / "shadow" / "shadow.csv", delimiter=",", names=True)
+    before, after = table[f"applied_{PULL}"][99:-2], table[f"applied_{PULL}"][100:-1]
+    moves = np.corrcoef(table[PULL][100:-1] - before, after - before)
+    assert moves[0, 1] > 0.7  # the controller beside its own loop, whose drives are slow
+    assert "RMS" in (tmp_path / "shadow" / "README.md").read_text()
 
 
 @needs_compiler
@@ -213,7 +363,7 @@ def test_the_c_is_clean_under_sanitizers_whatever_it_reads(name, tmp_path):
         given["ring_radius_mm"] += rng.normal(0.0, 0.1)
         if k % 3 == 2:
             given[str(rng.choice([port.name for port in INPUTS]))] = float(rng.choice(odd))
-        rows.append(" ".join(repr(given[port.name]) for port in INPUTS))
+        rows.append(" ".join(repr(float(given[port.name])) for port in INPUTS))
         outputs, memory = block.run(given, memory)
         expected.append([outputs[output][0] for output in (PULL, HEATER, ALARMS)])
     done = subprocess.run(["./block"], input="\n".join(rows), cwd=tmp_path, capture_output=True, text=True, check=True)
@@ -236,8 +386,11 @@ def test_no_reading_brings_a_setpoint_outside_its_limits(name, samples):
     known = {name: port.default for name, port in plant.block.ports.items()}
     for sample in samples:
         outputs = plant(**{"time": plant.time + 5.0} | sample)
-        assert 0.9 <= outputs[PULL] <= 1.4
-        assert known["heater_power_min_kW"] <= outputs[HEATER] <= known["heater_power_max_kW"]
+        applied = [given for each in samples if 0.0 <= (given := each.get("pull_speed_mm_per_min", 1.2)) <= 13.3]
+        assert min([0.9, *applied]) <= outputs[PULL] <= max([1.4, *applied])  # ramps from the drives into the range
+        applied = [given for each in samples if abs(given := each.get("heater_power_kW", 58.0)) <= 160.0]
+        low, high = known["heater_power_min_kW"], known["heater_power_max_kW"]
+        assert min([low, *applied]) <= outputs[HEATER] <= max([high, *applied])
         assert outputs[ALARMS] >= 0
 
 
@@ -295,7 +448,9 @@ def test_the_clock_is_watched_and_no_sample_is_taken_twice():
     assert int(plant(time=np.nan)[ALARMS]) & Alarm.CLOCK
     assert int(plant(time=105.0)[ALARMS]) == 0
     assert int(plant(time=112.0)[ALARMS]) == Alarm.LATE
-    old = plant.alarms(ring_time_s=plant.time - 30.0)
+    assert int(plant()[ALARMS]) == 0
+    old = plant.alarms(ring_time_s=plant.time - 30.0)  # the camera's latency is 5 s
+    assert plant.alarms(ring_time_s=plant.time - 10.0) == 0
     assert old == Alarm.RING
 
 
@@ -312,7 +467,72 @@ def test_ranges_and_slew_rates_hold():
     assert int(outputs[ALARMS]) & Alarm.HEATER_LIMITED
 
 
-@pytest.mark.parametrize(("name", "to", "files"), [("lqg-at-0.02", "c", 3), ("ppo", "st", 2), ("lqg", "onnx", 2)])
+@pytest.mark.parametrize("runner", LANGUAGES)
+def test_a_gap_is_a_takeover_from_the_drives_and_ranges_are_reached_by_ramps(runner):
+    """An hour without a call, in which the operator moved the drives; the heater beyond its range."""
+    plant = Plant(
+        "paper-tuned", runner, heater_slew_kW_per_min=1.0, heater_power_max_kW=70.0, pull_slew_mm_per_min2=0.2
+    )
+    for _ in range(30):
+        plant(pull_speed_mm_per_min=0.9)
+    moved = {"pull_speed_mm_per_min": 1.2, "heater_power_kW": 75.0}
+    outputs = plant(time=3600.0, **moved)
+    assert (outputs[PULL], outputs[HEATER]) == (1.2, 75.0)
+    assert int(outputs[ALARMS]) & (Alarm.TAKEOVER | Alarm.FALLBACK | Alarm.LATE) == Alarm.TAKEOVER | Alarm.LATE
+    for _ in range(100):
+        before, outputs = outputs, plant(pull_speed_mm_per_min=outputs[PULL], heater_power_kW=outputs[HEATER])
+        assert abs(outputs[HEATER] - before[HEATER]) <= 1.0 / 12.0 + 1e-9
+        assert abs(outputs[PULL] - before[PULL]) <= 0.2 / 12.0 + 1e-9
+    assert outputs[HEATER] <= 70.0
+    stopped = plant(automatic=0.0, pull_speed_mm_per_min=0.0, heater_power_kW=80.0)
+    assert (stopped[PULL], stopped[HEATER]) == (0.0, 80.0)
+
+
+@pytest.mark.parametrize("runner", LANGUAGES)
+def test_without_drives_the_set_nominal_values_hold_and_wrong_settings_refuse_to_start(runner):
+    gone = {"pull_speed_mm_per_min": np.nan, "heater_power_kW": np.nan}
+    plant = Plant("paper-tuned", runner, nominal_heater_power_kW=56.7)
+    outputs = plant(**gone)
+    assert (outputs[PULL], outputs[HEATER]) == (1.2, 56.7)
+    assert int(outputs[ALARMS]) & (Alarm.MANUAL | Alarm.DRIVES) == Alarm.MANUAL | Alarm.DRIVES
+    assert Alarm.TAKEOVER in plant.alarms(heater_power_kW=57.0)
+    for wrong in (
+        {"nominal_T_1_K": np.nan}, {"pull_slew_mm_per_min2": np.inf}, {"takeover_s": np.nan}, {"gap_s": 0.0},
+        {"pull_speed_min_mm_per_min": 1.5, "pull_speed_max_mm_per_min": 1.0}, {"heater_slew_kW_per_min": -1.0},
+    ):  # fmt: skip
+        outputs = Plant("paper-tuned", runner, **wrong)(pull_speed_mm_per_min=1.3)
+        assert outputs[PULL] == 1.3
+        assert int(outputs[ALARMS]) & (Alarm.SETTINGS | Alarm.MANUAL) == Alarm.SETTINGS | Alarm.MANUAL
+
+
+@pytest.mark.parametrize("runner", LANGUAGES)
+def test_drives_that_do_not_follow_raise_a_bit_and_are_taken_as_applied(runner):
+    plant = Plant("paper-tuned", runner)
+    alarms = [plant.alarms(ring_radius_mm=104.0, pull_speed_mm_per_min=1.2) for _ in range(120)]
+    assert Alarm.ASTRAY not in alarms[10]
+    assert Alarm.ASTRAY in alarms[-1]
+    assert Alarm.FALLBACK not in alarms[-1]
+    assert abs(plant(ring_radius_mm=104.0)[PULL] - 1.2) <= 0.25
+
+
+@pytest.mark.parametrize("runner", LANGUAGES)
+@pytest.mark.parametrize("reading", [np.nan, 0.0, 1806.0, "stuck"])
+def test_without_a_pyrometer_the_heater_holds_and_a_bit_says_so(runner, reading):
+    plant, rng = Plant("paper-tuned", runner), np.random.default_rng(0)
+    T_1 = plant.block.ports["nominal_T_1_K"].default
+    for _ in range(30):
+        before = plant(T_1_K=T_1 + rng.normal(0.0, 0.1))
+    gone = T_1 if reading == "stuck" else reading
+    power = before[HEATER]
+    for k in range(200):
+        outputs = plant(T_1_K=gone, heater_power_kW=power)
+        power = outputs[HEATER]
+        assert bool(int(outputs[ALARMS]) & Alarm.PYROMETER) == (reading != "stuck" or k > 24)
+    assert abs(power - before[HEATER]) < 0.3
+    assert Alarm.PYROMETER not in plant.alarms(T_1_K=T_1 + 0.5)
+
+
+@pytest.mark.parametrize(("name", "to", "files"), [("lqg-at-0.02", "c", 4), ("ppo", "st", 3), ("lqg", "onnx", 3)])
 def test_the_command_writes_a_folder(name, to, files, tmp_path):
     assert main([name, "--to", to, "--out", str(tmp_path)]) == 0
     assert len(list(tmp_path.iterdir())) == files

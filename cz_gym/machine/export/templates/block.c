@@ -19,7 +19,11 @@ void ${name}_reset($name *block)
 
 void ${name}_step($name *block, const ${name}_measured *measured, ${name}_setpoints *setpoints)
 {
+    int again = 1, sample;
+    $places
     $work
 
-    $body
+    for (sample = 0; again && sample < $samples; sample++) {
+        $body
+    }
 }

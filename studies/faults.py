@@ -1,0 +1,174 @@
+"""What a block does with the trouble of a plant: ``python -m studies.faults``.
+
+Every controller's block grows the same crystals without and with each fault: calls that come early, late or unevenly, a
+pyrometer that is gone for two hours, nominal values that are off, drives that stand still. The environment runs at half
+of the block's interval, and the ring's time is that of its frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.config import make_config
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.evaluation.report.tables import markdown
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.machine.export.compiled import CompiledBlock
+from cz_gym.machine.export.controllers import make_block
+from cz_gym.machine.export.policy import BlockPolicy, Runner
+from cz_gym.machine.export.ports import Alarm
+from cz_gym.machine.export.shell import Block
+from cz_gym.support.atomic_files import check_writable, write_files
+from cz_gym.support.command_line import OneLineParser, between
+from cz_gym.support.units import HOUR, MINUTE, MM
+
+GONE = 0.5 * HOUR, 2.5 * HOUR
+"""When a pyrometer is gone [s]."""
+STILL = 1.0 * HOUR, 1.0 * HOUR + 10.0 * MINUTE
+"""When the drives stand still [s]."""
+OFF = {"nominal_heater_power_kW": 2.0, "nominal_T_1_K": 10.0, "nominal_radius_mm": 0.2}
+"""What nominal values are off by."""
+SETTLED = 0.5 * HOUR
+"""Time from which errors count [s]."""
+
+
+class Fault(NamedTuple):
+    """What is done to a block between its plant and itself."""
+
+    pace: Sequence[float] = (1.0,)
+    """Times between calls in intervals of the block, multiples of a half, over and over."""
+    pyrometer: Callable[[Any, Any], Any] | None = None
+    """Its reading while it is gone, from the true one and the last one before."""
+    off: float = 0.0
+    """Error of the nominal values, in multiples of OFF."""
+    still: bool = False
+    """Whether the drives stand still for a while."""
+
+
+UNEVEN = tuple(np.random.default_rng(0).integers(1, 5, 997) / 2.0)
+FAULTS = {
+    "none": Fault(),
+    "twice as often": Fault((0.5,)),
+    "every 1.5 intervals": Fault((1.5,)),
+    "every 3 intervals": Fault((3.0,)),
+    "0.5 to 2 intervals": Fault(UNEVEN),
+    "pyrometer no number": Fault(pyrometer=lambda true, last: np.nan * true),
+    "pyrometer at 0": Fault(pyrometer=lambda true, last: 0.0 * true),
+    "pyrometer 20 K too high": Fault(pyrometer=lambda true, last: true + 20.0),
+    "pyrometer stuck": Fault(pyrometer=lambda true, last: last),
+    "nominal values too high": Fault(off=1.0),
+    "nominal values too low": Fault(off=-1.0),
+    "drives stand still": Fault(still=True),
+}
+
+
+class Faulty:
+    """A runner behind a fault."""
+
+    def __init__(self, block: Block, runner: Runner, fault: Fault) -> None:
+        self.fault, self.runner, self.dt = fault, runner, block.config.control_interval
+        self.off = {name: block.ports[name].default + fault.off * most for name, most in OFF.items()}
+        self.latency = max(each.sensor.latency for each in block.config.scenario.scenarios)
+        self.time, self.calls, self.due, self.bits = 0.0, 0, 0.0, 0
+        self.seen: Any = 0.0
+        self.held: dict[str, Any] = {}
+
+    def start(self, n: int) -> Any:
+        """The memory of n blocks before their first sample."""
+        return self.runner.start(n)
+
+    def run(self, inputs: Mapping[str, Any], memory: Any) -> Any:
+        """What the plant gets, and the next memory."""
+        time, self.time = self.time, self.time + 0.5 * self.dt
+        if time < self.due - 1e-6:
+            return self.held, memory
+        self.due = time + self.fault.pace[self.calls % len(self.fault.pace)] * self.dt
+        self.calls += 1
+        given = dict(inputs) | {"ring_time_s": np.asarray(inputs["time_s"]) - self.latency} | self.off
+        if self.fault.pyrometer and GONE[0] <= time < GONE[1]:
+            given["T_1_K"] = self.fault.pyrometer(inputs["T_1_K"], self.seen)
+        else:
+            self.seen = inputs["T_1_K"]
+        outputs, memory = self.runner.run(given, memory)
+        if time > SETTLED:
+            self.bits |= int(np.bitwise_or.reduce(outputs["alarms"].astype(np.int64)))
+        if not (self.fault.still and STILL[0] <= time < STILL[1]):
+            self.held = outputs
+        return self.held, memory
+
+
+class Row(NamedTuple):
+    """A controller under a fault."""
+
+    rmse: float
+    """From half an hour on, of the crystals that were kept [mm]."""
+    lost: int
+    alarms: Alarm
+
+
+def grow(block: Block, fault: str, crystals: int, runner: Runner | None = None, horizon: float = 3.0 * HOUR) -> Row:
+    """Grow validation crystals with a block, or what runs it, under the fault of that name."""
+    interval = 0.5 * block.config.control_interval
+    config = replace(block.config, control_interval=interval, horizon=horizon)
+    faulty = Faulty(block, runner or block, FAULTS[fault])
+    run = rollout(BlockPolicy(block, faulty, interval), config, VALIDATION_SEEDS[:crystals])
+    error = (run.signals.r_c - run.signals.r_ref)[round(SETTLED / interval) :, ~run.failed] / MM
+    return Row(float(np.sqrt(np.mean(np.square(error)))), int(run.failed.sum()), Alarm(faulty.bits))
+
+
+def report(rows: Mapping[tuple[str, str, str], Row], crystals: int) -> str:
+    """The table."""
+    lines = []
+    for (controller, language, fault), row in rows.items():
+        share = row.rmse / rows[controller, language, "none"].rmse
+        names = ", ".join(bit.name or "" for bit in row.alarms)
+        lines.append((controller, language, fault, f"{row.rmse:.3f}", f"{share:.2f}", str(row.lost), names))
+    heads = "controller", "language", "fault", "RMSE [mm]", "of none", "lost", "alarms"
+    return f"""# Blocks under the faults of a plant
+
+{crystals} validation crystals of three hours each, errors from half an hour on, of those that were kept.
+
+{markdown(heads, lines)}
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = OneLineParser("python -m studies.faults", "Blocks under the faults of a plant.")
+    add = parser.add_argument
+    parser.add_puller("its drives, its camera")
+    add(
+        "--controllers",
+        nargs="+",
+        default=["lqg-at-0.02", "paper-tuned", "fallback"],
+        metavar="NAME",
+        help="%(default)s",
+    )
+    add("--faults", nargs="+", choices=FAULTS, default=list(FAULTS), help="all unless given")
+    add("--crystals", type=between(1, 100), default=100, metavar="N", help="%(default)s")
+    add("--python", action="store_true", help="the blocks in Python, in place of their compiled C")
+    add("--out", type=Path, default=Path("results/faults"), metavar="FOLDER", help="%(default)s")
+    return parser.run(_main, arguments, "plant")
+
+
+def _main(given: argparse.Namespace) -> None:
+    check_writable(given.out)
+    config, rows = make_config("puller", observation="measured", action="direct", puller=given.puller), {}
+    for name in given.controllers:
+        block = make_block(name, config)
+        runner: Runner = block if given.python else CompiledBlock(block)
+        for fault in dict.fromkeys(["none", *given.faults]):
+            rows[name, "Python" if given.python else "C", fault] = row = grow(block, fault, given.crystals, runner)
+            print(name, fault, *row, flush=True)
+    write_files({given.out / "report.md": report(rows, given.crystals).encode()})
+
+
+if __name__ == "__main__":
+    sys.exit(main())
