@@ -14,14 +14,12 @@ are CasADi's. The prediction's numbers are deviations from the operating point i
 :data:`cz_gym.baselines.bounds.trajectory.SCALES`.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import warnings
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -82,9 +80,9 @@ class Prediction(NamedTuple):
     outputs_c: Floats
     """Sensitivity of the outputs, shape (n, stages, 5, corrections)."""
 
-    def of(self, slots: npt.NDArray[np.bool_]) -> Prediction:
+    def of(self, slots: npt.NDArray[np.bool_]) -> Self:
         """The prediction of some slots."""
-        return Prediction(*(part[slots] for part in self))
+        return type(self)(*(part[slots] for part in self))
 
 
 @dataclass(frozen=True)

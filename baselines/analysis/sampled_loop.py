@@ -15,13 +15,14 @@ from scipy.optimize import bisect
 from scipy.signal import cont2discrete
 
 from cz_gym.action import HEATER_RANGE
-from cz_gym.baselines.policy import Floats, State, map_arrays
+from cz_gym.baselines.policy import Floats, State
 from cz_gym.body.linearisation import OUTPUTS, STATES, linearise
 from cz_gym.body.plant import Puller, make_puller
 from cz_gym.errors import CzError
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured, scales
 from cz_gym.physics.linearisation import StateSpace
 from cz_gym.physics.parameters import Parameters
+from cz_gym.support.nested import map_arrays
 
 _SMALL = 1e-6
 """Observed amplitude below every limit, gate and dead zone [-]; float32 actions keep their relative precision."""

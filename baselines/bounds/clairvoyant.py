@@ -5,8 +5,6 @@ During the episode its inputs are applied. The optimum's own feedback on the tru
 contain: a heater that moves in steps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -42,11 +40,8 @@ class Clairvoyant:
     hash = ""
     """Hash of its settings, of which there are none."""
 
-    def for_episodes(self, config: Config, seeds: Sequence[int]) -> OptimalInputs:
-        """The optimal inputs of the first episode of each seed; CzError names the seeds whose optimum is not reached.
-
-        One episode a slot, in the order of the seeds.
-        """
+    def for_episodes(self, config: Config, seeds: Sequence[int]) -> "OptimalInputs":
+        """The optimal inputs of each seed's first episode, one a slot; CzError names the seeds that have none."""
         future = future_of(config, seeds)
         limits = limits_of(config.sole_scenario.actuators, config.ranges, config.control_interval)
         best = optimise(future, limits)

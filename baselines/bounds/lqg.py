@@ -60,15 +60,11 @@ class PrivilegedLQG(LQG):
         """The same controller for those episodes, one a slot."""
         designs = [self.design] * len(seeds)
         if self.knows_fluctuations:
-            designs = [_with_fluctuations(self.design, *each) for each in fluctuations_of(config, seeds)]
+            sds = np.maximum(fluctuations_of(config, seeds), _LEAST_SD).tolist()
+            noises = [replace(self.design.noise, fast_sd=fast, slow_sd=slow) for fast, slow in sds]
+            designs = [replace(self.design, noise=noise) for noise in noises]
         solved = solve_each(designs, config.control_interval, pullers_of(config, seeds), config.meniscus)
         return replace(self, gains_by_slot=solved)
-
-
-def _with_fluctuations(design: LQGDesign, fast: float, slow: float) -> LQGDesign:
-    """The design for fluctuations of those standard deviations [K]."""
-    noise = replace(design.noise, fast_sd=max(fast, _LEAST_SD), slow_sd=max(slow, _LEAST_SD))
-    return replace(design, noise=noise)
 
 
 class Exact(NamedTuple):

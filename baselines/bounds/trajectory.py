@@ -96,8 +96,7 @@ def sweep_forward(stages: Stages, feedback: Floats, forward: Floats) -> tuple[Fl
 
 
 def _times(matrix: Floats, vector: Floats) -> Floats:
-    product: Floats = (matrix @ vector[..., None])[..., 0]
-    return product
+    return (matrix @ vector[..., None])[..., 0]
 
 
 class Limits(NamedTuple):
@@ -152,7 +151,8 @@ def optimise(future: Future, limits: Limits) -> Trajectory:
         feedback, forward = sweep_back(stages)
         after, moves = sweep_forward(stages, feedback, forward)
         dz = after * SCALES
-        ds = _slopes(after[:, :, STATES:], moves)
+        held = after[:, :, STATES:]
+        ds = np.stack([-held, held, -moves, moves])
         df = barrier / slack - force - force / slack * ds
         fraction = np.minimum(_step_fraction(slack, ds), _height_fraction(x[1:, :, 1], dz[:, :, 1], future))
         x[1:] += fraction[:, None] * dz[:, :, :STATES]
@@ -218,11 +218,6 @@ def _slacks(u: Floats, nominal: Floats, limits: Limits) -> Floats:
     held = (u - nominal) / SCALES[STATES:]
     moves = np.diff(u, axis=0, prepend=nominal[None]) / SCALES[STATES:]
     return np.stack([limits.span - held, limits.span + held, limits.move - moves, limits.move + moves])
-
-
-def _slopes(held: Floats, moves: Floats) -> Floats:
-    """Changes of the slacks with inputs and moves."""
-    return np.stack([-held, held, -moves, moves])
 
 
 def _step_fraction(values: Floats, changes: Floats) -> Floats:

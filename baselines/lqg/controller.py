@@ -13,11 +13,12 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from cz_gym.baselines.policy import Floats, MeasuredController, stack
+from cz_gym.baselines.policy import Floats, MeasuredController
 from cz_gym.body.cost import WEIGHTS, Weights
 from cz_gym.body.plant import Puller, make_puller
 from cz_gym.observation import Measured
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.support.nested import stack
 from cz_gym.support.units import KILO
 
 from .estimator import PlantFilter

@@ -11,12 +11,6 @@ import numpy.typing as npt
 from cz_gym.baselines.policy import Floats
 
 
-def predicted_covariance(P: Floats, A: Floats, Q: Floats) -> Floats:
-    """A P A' + Q for P of shape (n, states, states); A and Q have the same shape or are shared by the slots."""
-    predicted: Floats = A @ P @ np.swapaxes(A, -1, -2) + Q
-    return predicted
-
-
 def correct(
     mean: Floats, P: Floats, row: Floats, innovation: Floats, variance: Floats, gate: float
 ) -> tuple[Floats, Floats]:

@@ -6,8 +6,6 @@ Ornstein-Uhlenbeck process, so the drift is a slowly bending ramp), and an unkno
 removes the offset between T_1 and the pyrometer). The drift also follows a share of the recipe's known movement.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 

@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.baselines.policy import Floats, map_arrays, select
+from cz_gym.baselines.policy import Floats
 from cz_gym.observation import Measured
+from cz_gym.support.nested import map_arrays, select
 
 from .estimator import FilterState, PlantFilter
 from .model import plant_model

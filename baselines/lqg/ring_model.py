@@ -103,8 +103,7 @@ def undelayed_row(model: PlantModel, ring: RingModel, dt: float) -> Floats:
 def oscillator(omega: Floats, ring: RingModel, dt: float) -> Floats:
     """Transition of the ripple's two states over dt [s] at frequencies omega [rad/s], shape (n, 2, 2)."""
     c, s = np.cos(omega * dt), np.sin(omega * dt)
-    turned: Floats = math.exp(-dt / ring.ripple_tau) * np.stack([c, -s, s, c], axis=-1).reshape(*omega.shape, 2, 2)
-    return turned
+    return math.exp(-dt / ring.ripple_tau) * np.stack([c, -s, s, c], axis=-1).reshape(*omega.shape, 2, 2)
 
 
 def transition(A: Floats, row: Floats, omega: Floats, ring: RingModel, dt: float) -> Floats:

@@ -92,10 +92,11 @@ def agent(name: str, policies: Sequence[Any], own: bool = False) -> Contender:
     one = contracts[0]
     meaning = f"agent trained with {one.algorithm} on {one.scenario}{', given as a file' if own else ''}"
     return Contender(
-        name, partial(_given, policies[0]), one.observation, meaning,
+        name, partial(unchanged, policies[0]), one.observation, meaning,
         action=one.action, own=own, training_seeds=seeds, trained=tuple(policies),
     )  # fmt: skip
 
 
-def _given(policy: Any, config: Config) -> Any:
+def unchanged(policy: Any, config: Config) -> Any:
+    """The policy, whatever the environment is."""
     return policy

@@ -3,10 +3,7 @@
 A controller that moves the pull speed more can hold the radius better, so two radius errors are comparable only at
 equal activity, the RMS of the pull step. A *reference family* is one controller tuned for several activities; its
 members span a frontier of radius error against activity. Between the members, the logarithm of the radius error is a
-monotone cubic (Fritsch and Carlson's PCHIP) of the logarithm of the activity::
-
-    curve = frontier([(0.005, 0.14), (0.01, 0.10), (0.02, 0.07)])  # activity [mm/min], radius error [mm]
-    curve.at(0.015)                                                # radius error of the family there [mm]
+monotone cubic (Fritsch and Carlson's PCHIP) of the logarithm of the activity.
 """
 
 from collections.abc import Mapping, Sequence

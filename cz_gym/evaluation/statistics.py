@@ -6,10 +6,8 @@ paired in every resample. Training seeds are crossed with episodes (every traine
 and episodes are resampled on their own and their weights multiply.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -53,7 +51,7 @@ class Resamples:
     episodes: Floats
 
     @classmethod
-    def draw(cls, episodes: int, count: int = RESAMPLES) -> Resamples:
+    def draw(cls, episodes: int, count: int = RESAMPLES) -> Self:
         """Draw multinomial counts over ``episodes``, ``count`` times. Raises CzError without episodes."""
         return cls(_weights(episodes, count, np.random.default_rng(SEED)))
 
