@@ -1,16 +1,11 @@
 """Nonlinear model-predictive control: a bank of the LQG's filters, and CasADi's prediction by the plant's equations.
 
-At every sample the next minutes are predicted under the regulator's law,
+At every sample the next minutes are predicted under the regulator's law with corrections c_k, constant in blocks,
 
     du_k = -K (z_k - (r_ref,k, 0, ...)) + f_k + c_k,    z_k = (plant's five states, previous inputs),
 
-with its feedback K, its feedforward f_k of the known recipe and disturbances, and corrections c_k that are constant in
-blocks. One Gauss-Newton step (Diehl's real-time iteration) finds the best corrections; where limits of drives matter,
-CasADi solves a quadratic programme. The cost beyond the horizon is the law's own cost-to-go, so on a linear plant
-without limits the best corrections are zero and the moves are the LQG's: only limits and curvature bring a gain.
-
-The functions of :mod:`cz_gym.body.plant` take CasADi's symbols, so no equation is written twice and the derivatives
-are CasADi's. The prediction's numbers are deviations from the operating point in the units of
+and one Gauss-Newton step finds the best corrections (docs/controllers/mpc.md). On a linear plant without limits they
+are zero. The prediction's numbers are deviations from the operating point in the units of
 :data:`cz_gym.baselines.bounds.trajectory.SCALES`.
 """
 

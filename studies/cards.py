@@ -37,7 +37,8 @@ Results = Mapping[str, Mapping[str, Mapping[str, Estimate]]]
 
 def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -> str:
     """An agent's section."""
-    first = contracts[0]
+    first, taken = contracts[0], sorted(contract.training_steps / 1e6 for contract in contracts)
+    steps = " to ".join(dict.fromkeys(f"{each:.0f}" for each in (taken[0], taken[-1])))
     rows = [
         [scenario, *(column.text(of[name][column.metric]) for column in FIGURES)] for scenario, of in results.items()
     ]
@@ -47,7 +48,7 @@ def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -
             f"## `{name}`",
             "",
             f"- How it learned: {how}.",
-            f"- Saw: crystals of {first.scenario}; kept after {_steps(contracts)}.",
+            f"- Saw: crystals of {first.scenario}; kept after {steps} million steps.",
             f"- Reads: `{first.observation}`; acts every {first.control_interval:g} s; its action is `{first.action}`.",
             f"- Training seeds: {len(contracts)}. `agents.load({name!r})` is the one of least validation cost.",
             "- Fails: " + (f"loses crystals of {', '.join(fails)}." if fails else "on none of these."),
@@ -56,13 +57,6 @@ def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -
             "",
         ]
     )
-
-
-def _steps(contracts: Sequence[Contract]) -> str:
-    """Number of environment steps after which its runs kept it."""
-    taken = [contract.training_steps / 1e6 for contract in contracts]
-    steps = [f"{least_or_most(taken):.0f}" for least_or_most in (min, max)]
-    return f"{' to '.join(dict.fromkeys(steps))} million steps"
 
 
 ABOUT = """# Model cards

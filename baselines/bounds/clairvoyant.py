@@ -1,8 +1,7 @@
 """The lowest bound: the optimal trajectory for known parameters, state and future disturbances.
 
-The trajectory is optimised before the episode, for the reward's own cost (:mod:`cz_gym.baselines.bounds.trajectory`).
-During the episode its inputs are applied. The optimum's own feedback on the true state corrects what the plan does not
-contain: a heater that moves in steps.
+Its inputs are applied; the optimum's own feedback on the true state corrects what the plan does not contain: a heater
+that moves in steps.
 """
 
 from collections.abc import Sequence

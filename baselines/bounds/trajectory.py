@@ -1,10 +1,7 @@
 """The optimal trajectory of an episode with a known future: Newton steps by Riccati sweeps, limits by interior points.
 
-Direct multiple shooting (Bock and Plitt 1984): states and inputs of all steps are unknowns. The dynamics of all steps
-are linearised at once, by complex step through the environment's own equations. One Riccati sweep back and one forward
-solve the banded problem, in a time that grows with the number of steps, not its cube. A primal-dual barrier keeps the
-drives' limits (Wright 1997). The cost is quadratic, so leaving out the dynamics' curvature (Gauss-Newton) costs a
-little speed and no accuracy.
+Direct multiple shooting (docs/controllers/bounds.md): all steps are linearised at once, by complex step through the
+environment's own equations, and solved in a time that grows with their number, not its cube.
 """
 
 import math
@@ -39,23 +36,17 @@ _STEP = 1e-30
 class Stages(NamedTuple):
     """The problem of a Newton step: N stages for n slots, diagonal costs.
 
-    Minimise sum_k 1/2 z' Q z + q' z (after each stage) + 1/2 w' R w + r' w with z_{k+1} = A z_k + B w_k + c_k.
+    Minimise sum_k 1/2 z' Q z + q' z (after each stage) + 1/2 w' R w + r' w with z_{k+1} = A z_k + B w_k + c_k. A has
+    shape (N, n, states, states), B (N, n, states, inputs), c, Q and q (N, n, states), R and r (N, n, inputs).
     """
 
     A: Floats
-    """Shape (N, n, states, states)."""
     B: Floats
-    """Shape (N, n, states, inputs)."""
     c: Floats
-    """Constant term of the next state, shape (N, n, states)."""
     Q: Floats
-    """Curvature of the cost by the state after the stage, shape (N, n, states)."""
     q: Floats
-    """Slope of the cost by the state after the stage, shape (N, n, states)."""
     R: Floats
-    """Curvature of the cost by the stage's input, shape (N, n, inputs)."""
     r: Floats
-    """Slope of the cost by the stage's input, shape (N, n, inputs)."""
 
 
 def sweep_back(stages: Stages) -> tuple[Floats, Floats]:

@@ -1,9 +1,6 @@
-"""Linear-quadratic-Gaussian control of pull speed and heater together.
+"""Linear-quadratic-Gaussian control of pull speed and heater together: filter, regulator and their design.
 
-An extended Kalman filter (:mod:`cz_gym.baselines.lqg.estimator`), or a bank of them, estimates the augmented plant
-(:mod:`cz_gym.baselines.lqg.model`). A regulator with costs on input moves and five minutes of recipe preview acts on
-the estimate (:mod:`cz_gym.baselines.lqg.regulator`). The filter's inputs are the ones that the drives applied, so
-limits and slew rates never wind anything up.
+The filter's inputs are the ones that the drives applied, so limits and slew rates never wind anything up.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,7 @@
 """A camera with latency and a ring that ripples with the crystal's rotation, as states of the LQG's plant model.
 
-Latency: the rings of past samples are states, so a frame some seconds old corrects the state of that time. Ripple: an
-oscillator of two states with a slowly wandering phase (a narrow-band process), at the rotation's frequency, aliased by
-sampling. This frequency is unknown; it is found as the peak in the spectrum of the ring's residual.
+Latency: the rings of past samples are states. Ripple: an oscillator with a slowly wandering phase, at the rotation's
+frequency, aliased by sampling, which is found as the peak in the spectrum of the ring's residual.
 """
 
 import math

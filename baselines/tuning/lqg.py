@@ -96,12 +96,10 @@ def lqg_goal(
     pull_step: float,
     by_return: bool,
 ) -> Goal:
-    """Maximise the return, or minimise the radius error, within an observable RMSE [mm] and a pull step RMS [mm/min].
-
-    Scores are about 10.
-    """
+    """Maximise the return, or minimise the radius error, within an observable RMSE and a pull step RMS [mm/min]."""
 
     def objective(figures: Figures) -> float:
+        # Scores are about 10.
         cost = -figures.mean_return / figures.steps if by_return else figures.rmse_mm / rmse_mm
         return 10.0 * cost + 100.0 * figures.failure_rate
 

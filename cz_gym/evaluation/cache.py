@@ -1,8 +1,7 @@
 """Cached episodes of slow controllers, and the bound of an earlier benchmark: neither needs to run again.
 
 The cache has one file an episode, in a folder named by controller, scenario and a hash of all that the results depend
-on: the controller's settings, the environment's (plant, scenario, interval, horizon), the code of both, and the
-packages that compute.
+on: settings and code of controller and environment, and the packages that compute.
 """
 
 import hashlib

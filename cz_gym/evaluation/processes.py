@@ -14,9 +14,8 @@ from cz_gym.errors import CzError
 from cz_gym.support.processors import processors
 
 WAIT = 1.0
-"""Longest time between two calls of :data:`Look` [s]."""
+"""Longest time between two calls of :data:`Look` [s], a function that is called while tasks run."""
 Look = Callable[[], None]
-"""A function that is called about once a second while tasks run."""
 
 
 def through(

@@ -1,9 +1,8 @@
 """Uncertainty of the benchmark's figures: 95 % percentile bootstrap over episodes and training seeds.
 
-Values have shape (training seeds, episodes, metrics); a controller that is not trained has one "seed". All controllers
-of a scenario meet the same crystals, so one set of resampled episodes serves them all: metrics and controllers stay
-paired in every resample. Training seeds are crossed with episodes (every trained copy meets every crystal), so seeds
-and episodes are resampled on their own and their weights multiply.
+Values have shape (training seeds, episodes, metrics); a controller that is not trained has one "seed". All meet the
+same crystals, so one set of resampled episodes serves them all; training seeds are crossed with episodes, so both are
+resampled on their own and their weights multiply.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,7 @@
 """Numbers that Part II prints, its design, and its experiments on our nonlinear plant; each result is computed once.
 
 Bukhari, Hovd and Winkler, "Inverse response behaviour in the bright ring radius measurement of the Czochralski process
-II: Mitigation by control", Journal of Crystal Growth. Its controller's own numbers are the defaults that it is built
-with.
+II: Mitigation by control", Journal of Crystal Growth.
 """
 
 from functools import cache

@@ -80,13 +80,6 @@ def test_a_failure_counts_eight_millimetres_to_the_end(steps):
     assert found.failure_rate == 1
 
 
-def test_an_early_failure_never_lowers_the_error():
-    errors = [of(made_up(50, lived=lived, r_c=R + 7e-3)) for lived in range(1, 51)]
-    rmse = [found.rmse_mm for found in errors]
-    assert rmse == sorted(rmse, reverse=True)
-    assert min(rmse) > of(made_up(50, r_c=R + 7e-3)).rmse_mm
-
-
 def test_signals_after_a_failure_do_not_count():
     """The slot goes on with another crystal, or with NaN: no metric reads it."""
     steps, lived = 800, 300

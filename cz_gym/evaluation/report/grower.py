@@ -133,8 +133,5 @@ def _margins(sample: Sample, result: Result) -> tuple[str, ...]:
     if any(np.isnan(loop.sensitivity) for loop in loops):
         return ("unstable", *absent[1:])
     worst = (np.nanmin, "gain_up"), (np.nanmax, "gain_down"), (np.nanmin, "phase_deg"), (np.nanmin, "delay")
-    return tuple(_figure(pick, [getattr(loop, name) for loop in loops]) for pick, name in worst)
-
-
-def _figure(pick: Any, values: list[float]) -> str:
-    return "no limit" if np.isnan(values).all() else f"{pick(values):.3g}"
+    values = ((pick, [getattr(loop, name) for loop in loops]) for pick, name in worst)
+    return tuple("no limit" if np.isnan(both).all() else f"{pick(both):.3g}" for pick, both in values)
