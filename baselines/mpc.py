@@ -115,10 +115,7 @@ class EkfMpc(LQG):
         return limits_of(self.actuators, (self.v_0, self.heater_range), self.control_interval)
 
     def law(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
-        """The best inputs [m/s, W], deviations, shape (n, 2); the LQG's own in slots where the prediction fails.
-
-        Arguments are those of :meth:`cz_gym.baselines.lqg.controller.LQG.law`.
-        """
+        """The best inputs, as :meth:`LQG.law` returns them, whose own stand in slots where the prediction fails."""
         gains, shape, scale = self.gains, self.shape, SCALES[PLANT:]
         share = self.design.noise.recipe_share
         disturbances = expected_disturbances(estimate, plan, gains, share, shape.stages)

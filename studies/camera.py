@@ -60,10 +60,7 @@ class Response(NamedTuple):
 
 
 def read_rings(detector: RingDetector, r_c: Any, h_c: Any, images: Any = None) -> dict[str, Floats]:
-    """The three readings of crystals of radius r_c on menisci of height h_c [m], less those at rest.
-
-    r_c and h_c broadcast. ``images`` of the crystals, in order, are traced unless given.
-    """
+    """Readings of crystals of radius r_c on menisci of height h_c [m], less those at rest; without images they are traced."""
     r, h = np.broadcast_arrays(r_c, h_c)
     pairs = list(zip(r.ravel().tolist(), h.ravel().tolist(), strict=True))
     shown = [picture(*pair, PULLER, VIEW) for pair in pairs] if images is None else images

@@ -117,10 +117,7 @@ def batched(env: Any, num_envs: int) -> Stepper:
 
 
 def our_batch(num_envs: int, threads: int, resets: bool = True) -> Stepper:
-    """The native batch, its slots at random steps of their episodes, so that resets are spread out.
-
-    Without ``resets`` it repeats the same first minutes, to be compared with the bare loop.
-    """
+    """The native batch at random steps of its episodes; without ``resets`` it repeats the same first minutes."""
     env = CzVectorEnv(num_envs, observation="measured", threads=threads)
     env.reset(seed=0)
     if not resets:

@@ -176,10 +176,7 @@ def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -
 def stable_range(
     controller: StateSpace, dt: float, parameter: str, lam: float, nominal: Parameters = _NOMINAL
 ) -> tuple[float, float]:
-    """The range of a factor on that parameter of a puller, around 1, in which the closed loop is stable.
-
-    It ends at 1/WIDEST and WIDEST; both ends are NaN if the loop is unstable with the puller as it is.
-    """
+    """Range of a factor on that parameter, at most 1/WIDEST to WIDEST, in which the loop is stable; NaN if not at 1."""
 
     def stable(factor: float) -> bool:
         puller = make_puller(nominal._replace(**{parameter: factor * getattr(nominal, parameter)}), lam)

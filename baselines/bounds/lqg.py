@@ -37,8 +37,8 @@ _TINY = 1e-9
 class PrivilegedLQG(LQG):
     """The LQG with each slot's own puller as its model: a bound on the worth of the parameters.
 
-    With ``knows_fluctuations`` its filter also has the strength of each crystal's interface fluctuations, where other
-    LQGs assume the average. Before ``for_episodes`` it is the LQG of the nominal puller.
+    With ``knows_fluctuations`` its filter has the strength of each crystal's interface fluctuations too. Before
+    ``for_episodes`` it is the LQG of the nominal puller.
     """
 
     gains_by_slot: Gains | None = None
@@ -77,8 +77,7 @@ class Exact(NamedTuple):
 class TrueState(NamedTuple):
     """A filter that sees the state and the present disturbances.
 
-    Only the sum of the two interface fluctuations is seen: a noise-free Kalman filter of two states separates them.
-    The drift is the one whose static load is seen, its rate the last change.
+    It separates the two interface fluctuations, of which the sum is seen, by a noise-free Kalman filter.
     """
 
     models: PlantFilter

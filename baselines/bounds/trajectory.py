@@ -50,10 +50,7 @@ class Stages(NamedTuple):
 
 
 def sweep_back(stages: Stages) -> tuple[Floats, Floats]:
-    """The law that is optimal for every starting state: w_k = feedback_k z_k + forward_k.
-
-    feedback has shape (N, n, inputs, states), forward (N, n, inputs).
-    """
+    """The optimal law w_k = feedback_k z_k + forward_k, of shapes (N, n, inputs, states) and (N, n, inputs)."""
     N, n, states, inputs = stages.B.shape
     feedback, forward = np.empty((N, n, inputs, states)), np.empty((N, n, inputs))
     P, p = np.zeros((n, states, states)), np.zeros((n, states))

@@ -49,10 +49,7 @@ SURPRISE_MEMORY = 10.0 * MINUTE
 
 
 class PlantFilter(NamedTuple):
-    """The filter of one puller, or of one puller a slot.
-
-    With one a slot, fields of ``puller`` have shape (n,) and arrays of ``plant`` a leading axis n.
-    """
+    """The filter of one puller, or of one a slot: then ``puller`` and ``plant`` have a leading axis n."""
 
     puller: Any
     plant: PlantModel

@@ -37,10 +37,7 @@ class Regulator(NamedTuple):
 
 
 def quadratic_cost(weights: Weights, dt: float) -> tuple[Floats, Floats, Floats]:
-    """Q, N and R of the cost sum z' Q z + 2 z' N du + du' R du for a control interval of dt [s].
-
-    z has the plant's five states and the previous inputs.
-    """
+    """Q, N and R of the cost sum z' Q z + 2 z' N du + du' R du, z = (plant's states, previous inputs), for dt [s]."""
     Q, N = np.zeros((PLANT + 2, PLANT + 2)), np.zeros((PLANT + 2, 2))
     per_square = coefficients(weights)
     per_step = (STEP_TIME / dt) ** 2

@@ -187,10 +187,7 @@ FAMILY = tuple(each.name for each in LQGS if not each.by_return)
 
 
 def adaptive(plain: LQG) -> LQG:
-    """The same LQG with a bank of filters that estimates the strength of each crystal's interface fluctuations.
-
-    Its filters assume FACTORS times the standard deviations of the design, each pair equally likely at first.
-    """
+    """The same LQG with a bank of filters, for FACTORS times its standard deviations of the interface fluctuations."""
     noise = plain.design.noise
     fast, slow = (tuple(factor * sd for factor in FACTORS) for sd in (noise.fast_sd, noise.slow_sd))
     return replace(plain, hypotheses=Hypotheses(fast, slow))

@@ -70,8 +70,7 @@ def for_scenario(controller: str, scenario: Scenario) -> Mapping[str, float]:
 def for_puller(controller: str, puller: PullerFile) -> Mapping[str, float]:
     """The values that a search has chosen for a puller's file, by path; empty if there are none.
 
-    A puller made of the default one's file by other numbers has none. CzError if they were chosen for other numbers of
-    the puller.
+    CzError if they were chosen for other numbers of the puller.
     """
     path = folder_of(puller) / f"{controller}.json"
     if puller.file is None or path.parent == FOLDER / DEFAULT.name or not path.is_file():

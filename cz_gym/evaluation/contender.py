@@ -75,10 +75,9 @@ class Contender:
 
 
 def agent(name: str, policies: Sequence[Any], own: bool = False) -> Contender:
-    """An agent from its policies with a ``contract``, one a training seed.
+    """An agent, the user's ``own`` if it was given as a file, from its policies, one a training seed.
 
-    It is the user's ``own`` if it was given as a file. Raises CzError if the policies are not training seeds of one
-    agent.
+    Raises CzError if the policies are not training seeds of one agent.
     """
     contracts = [policy.contract for policy in policies]
     seeds = tuple(contract.training_seed for contract in contracts)

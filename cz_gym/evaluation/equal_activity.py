@@ -43,7 +43,7 @@ class Frontier(NamedTuple):
 
 
 def frontier(points: Sequence[Point]) -> Frontier:
-    """Return the frontier of these points; a point is left out if another has less activity and less error.
+    """Return the frontier of these points, without those that another one beats in both numbers.
 
     Raises CzError for numbers that are not positive, and if fewer than two points are left.
     """

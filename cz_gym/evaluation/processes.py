@@ -37,10 +37,7 @@ def through(
 def in_processes(
     function: Callable[[Any], Any], tasks: Sequence[Any], look: Look | None = None, processes: int | None = None
 ) -> Iterator[tuple[int, Any]]:
-    """Run ``function`` on every task in a pool of processes (None: one a processor), as :func:`through` does.
-
-    When the caller stops early, or is killed, the pool's processes end; no other process does.
-    """
+    """Run tasks as :func:`through` does, in a pool of processes (None: one a processor) that ends with its caller."""
     # Forking would copy the threads of torch and of the native batch in unknown states.
     context = get_context("spawn")
     leash, held = context.Pipe(duplex=False)

@@ -79,10 +79,7 @@ def differences(values: Floats, reference: Floats, resamples: Resamples) -> tupl
 
 
 def probability_of_improvement(values: Floats, reference: Floats, resamples: Resamples) -> Estimate:
-    """Estimate how often one metric (lower is better) is lower than the reference's on a crystal, ties half.
-
-    ``values`` and ``reference`` have shape (training seeds, episodes).
-    """
+    """Estimate how often a metric, shape (seeds, episodes), is lower than the reference's on a crystal, ties half."""
     ours, theirs = values[:, None], reference[None]
     wins = ((ours < theirs) + 0.5 * (ours == theirs)).mean(axis=1)[:, :, None]
     return means(wins, resamples)[0]
@@ -107,9 +104,9 @@ def cvar(values: Floats, resamples: Resamples) -> Estimate:
 
 
 def optimality_gap(costs: Floats, reference: Floats, bound: Floats, resamples: Resamples) -> Estimate | None:
-    """Estimate (J - J_bound) / (J_reference - J_bound), with J the mean loss over seeds and the same episodes.
+    """Estimate (J - J_bound) / (J_reference - J_bound), J the mean of losses of shape (training seeds, episodes).
 
-    All three have shape (training seeds, episodes). 0 is the bound, 1 the reference; None where the two are equal.
+    0 is the bound, 1 the reference; None where the two are equal.
     """
     three = costs, reference, bound
     ours, theirs, least = (values.mean() for values in three)

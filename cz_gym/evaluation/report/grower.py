@@ -65,10 +65,7 @@ def scrap(sample: Sample) -> Estimate | None:
 
 
 def outcome(result: Result, interval: bool = True) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Heads and rows of what a grower gets from each controller on one scenario, the fewest losses first.
-
-    Without intervals the table is short enough for a terminal.
-    """
+    """Heads and rows of a scenario's table for a grower, the fewest losses first; short without ``interval``."""
     head = f"scrap: diameter outside {band(result)}" if interval else f"outside {band(result)}"
     columns = Column("", f"{head} [% of time]", 2, PERCENT), *BESIDE[: None if interval else SHORT]
     column, *beside = (each._replace(interval=interval) for each in columns)
