@@ -64,16 +64,16 @@ class Shape(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """The prediction under the law, by slot, and its sensitivity to the corrections."""
+    """The prediction under the law by slot, with sensitivities to the corrections along a further, last axis.
+
+    ``last`` is the state z at the end, shape (n, 7), ``outputs`` each stage's radius error, inputs and moves, shape
+    (n, stages, 5).
+    """
 
     last: Floats
-    """State z at the end, shape (n, 7)."""
     last_c: Floats
-    """Sensitivity of the last state, shape (n, 7, corrections)."""
     outputs: Floats
-    """Radius error, inputs and moves of each stage, shape (n, stages, 5)."""
     outputs_c: Floats
-    """Sensitivity of the outputs, shape (n, stages, 5, corrections)."""
 
     def of(self, slots: npt.NDArray[np.bool_]) -> Self:
         """The prediction of some slots."""

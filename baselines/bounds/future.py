@@ -1,7 +1,4 @@
-"""The future of an episode: its puller, its start, its reference and every disturbance to come.
-
-It comes from the environment's own draws and schedules, and is for bounds only; no controller may read it.
-"""
+"""The future of an episode, from the environment's own draws and schedules, which only bounds may read."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

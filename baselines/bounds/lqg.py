@@ -1,7 +1,6 @@
 """Privileged LQGs: bounds on the worth of a perfect model, and of a perfect view of the present.
 
-They know what no controller can know, and stand in tables as bounds, never as contenders. Their method
-``for_episodes``, which a rollout calls, gives them this knowledge of the episodes that it is about to run.
+Their method ``for_episodes``, which a rollout calls, tells them of the episodes what no controller can know.
 """
 
 import math

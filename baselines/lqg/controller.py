@@ -1,7 +1,4 @@
-"""Linear-quadratic-Gaussian control of pull speed and heater together: filter, regulator and their design.
-
-The filter's inputs are the ones that the drives applied, so limits and slew rates never wind anything up.
-"""
+"""Linear-quadratic-Gaussian control of pull speed and heater together: filter, regulator and their design."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,8 +1,7 @@
 """The LQG's state estimator: an extended Kalman filter of the augmented plant on bright ring and pyrometer.
 
 The mean is predicted with the plant's own equations (or, with ``nonlinear=False``, with the linearised ones), the
-covariance with the linearised plant. The ring's slope is taken at the estimated meniscus, because a growing radius
-nearly doubles it and halves the right-half-plane zero. The camera's noise is estimated from the innovations.
+covariance with the linearised plant, the ring's slope taken at the estimated meniscus (docs/controllers/lqg.md).
 """
 
 from typing import Any, NamedTuple

@@ -1,7 +1,6 @@
 """The paper's controller made fit for service: measurement filter, anti-windup, bumpless start, trim of the recipe.
 
-The structure and the discretisation are those of :mod:`cz_gym.baselines.pid.compensated_pid` where they overlap. With
-``compensator=None`` it is a conventional PID. Radii [m], speeds [m/s], temperatures [K], power [W].
+With ``compensator=None`` it is a conventional PID. Radii [m], speeds [m/s], temperatures [K], power [W].
 """
 
 import math

@@ -1,7 +1,6 @@
 """Settings of PIDs in proportion to a puller.
 
-They follow from the default puller's: times from the time scale of the inverse response (one over the zero of G_m),
-gains from the plant's, the temperature loop's from the heater's capacity.
+Times follow the zero of G_m, gains the plant's, the temperature loop's the heater's capacity.
 """
 
 from functools import reduce

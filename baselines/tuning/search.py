@@ -76,9 +76,8 @@ class Search:
         measure: Measure = measure,
         quick: bool = False,
     ) -> None:
-        """At most ``trials`` candidates, each on ``episodes`` training episodes; tests replace ``measure``.
-
-        A ``quick`` search ends at QUICK_STEP, and only its finalists have to survive other scenarios.
+        """At most ``trials`` candidates, each on ``episodes`` training episodes; a ``quick`` search ends at QUICK_STEP,
+        and only its finalists have to survive other scenarios.
         """
         self.controller, self.goal, self.config, self.measure, self.quick = controller, goal, config, measure, quick
         self.budget, self.trials = {"trials": trials, "episodes": episodes}, list[Trial]()

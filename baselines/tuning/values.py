@@ -1,8 +1,7 @@
 """Values that searches have chosen for controllers, by scenario for the default puller, or for another puller.
 
 Those of the default puller are in ``cz_gym/machine/pullers/default``, a file a controller and scenario; those of
-another puller are in the folder beside its file. Each file has the history of its search (``cz-gym tune``), which was
-scored on training seeds and decided on validation seeds.
+another puller are in the folder beside its file. Each file has the history of its search (``cz-gym tune``).
 """
 
 import json

@@ -1,9 +1,7 @@
-"""Radius error at equal pull activity: how a controller compares with a family of references as active as itself.
+"""Radius error at equal pull activity: a controller that moves the pull speed more can hold the radius better.
 
-A controller that moves the pull speed more can hold the radius better, so two radius errors are comparable only at
-equal activity, the RMS of the pull step. A *reference family* is one controller tuned for several activities; its
-members span a frontier of radius error against activity. Between the members, the logarithm of the radius error is a
-monotone cubic (Fritsch and Carlson's PCHIP) of the logarithm of the activity.
+A *reference family* is one controller tuned for several activities, RMS of the pull step; its members span a frontier
+of radius error: a monotone cubic (Fritsch and Carlson's PCHIP) in logarithms of both.
 """
 
 from collections.abc import Mapping, Sequence

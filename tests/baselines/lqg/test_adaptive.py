@@ -53,10 +53,7 @@ def test_the_bank_weights_its_filters_by_bayes_rule():
 
 @pytest.mark.parametrize(("strength", "factor"), [(0.05, 0.2), (0.5, 1.0)])
 def test_the_adaptive_lqg_estimates_how_strong_the_fluctuations_are(strength, factor):
-    """After an hour, nine of ten crystals are most likely at the end of the hypotheses that is nearest.
-
-    With the design for known hot zones: where the hot zone may be another one, its heat hides part of the fluctuations.
-    """
+    """After an hour nine of ten crystals are at the nearest hypothesis; the design is that for known hot zones."""
     config = make_config("randomized", horizon=HOUR, **PLAIN)
     config = config.with_scenario(replace(config.scenario, name="one", interface=Interface(sd=(strength, strength))))
     watched = Watched(adaptive(NOMINAL_LQG.for_config(config)), 1)
