@@ -75,7 +75,7 @@ class SlowEpisodes:
 def earlier_bound(folder: Path, row: Row, samples: Sequence[Sample]) -> Sample | None:
     """The bound on a row from a folder of benchmark results, which has neither its signals nor its time.
 
-    None unless it met the row's first episodes, and a classical controller had the same figures then and now.
+    None unless that bound met the row's first episodes, and a classical controller had the same figures then and now.
     """
     try:
         earlier = read_episodes(folder / EPISODES, ("seed", *GAPS))[row.name]

@@ -36,7 +36,7 @@ def floor_of(results: Sequence[Result]) -> float:
 
 
 def pareto(results: Sequence[Result]) -> bytes:
-    """Draw mean RMSE against mean pull step RMS up to :data:`FAR`; the :func:`.chosen` have colours."""
+    """Draw mean RMSE, up to :data:`FAR` times the least, against pull step RMS; the :func:`.chosen` have colours."""
     samples = results[0].samples
     names, floor, style = [sample.name for sample in chosen(samples, NAMED)], floor_of(results), styles_of(samples)
     columns = min(len(results), 2)
