@@ -1,27 +1,20 @@
 """Nonlinear model-predictive control: a bank of the LQG's filters, and CasADi's prediction by the plant's equations.
 
-At every sample the next minutes are predicted under the regulator's law,
+At every sample the next minutes are predicted under the regulator's law with corrections c_k, constant in blocks,
 
     du_k = -K (z_k - (r_ref,k, 0, ...)) + f_k + c_k,    z_k = (plant's five states, previous inputs),
 
-with its feedback K, its feedforward f_k of the known recipe and disturbances, and corrections c_k that are constant in
-blocks. One Gauss-Newton step (Diehl's real-time iteration) finds the best corrections; where limits of drives matter,
-CasADi solves a quadratic programme. The cost beyond the horizon is the law's own cost-to-go, so on a linear plant
-without limits the best corrections are zero and the moves are the LQG's: only limits and curvature bring a gain.
-
-The functions of :mod:`cz_gym.body.plant` take CasADi's symbols, so no equation is written twice and the derivatives
-are CasADi's. The prediction's numbers are deviations from the operating point in the units of
+and one Gauss-Newton step finds the best corrections (docs/controllers/mpc.md). On a linear plant without limits they
+are zero. The prediction's numbers are deviations from the operating point in the units of
 :data:`cz_gym.baselines.bounds.trajectory.SCALES`.
 """
-
-from __future__ import annotations
 
 import hashlib
 import math
 import warnings
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -71,20 +64,20 @@ class Shape(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """The prediction under the law, by slot, and its sensitivity to the corrections."""
+    """The prediction under the law by slot, with sensitivities to the corrections along a further, last axis.
+
+    ``last`` is the state z at the end, shape (n, 7), ``outputs`` each stage's radius error, inputs and moves, shape
+    (n, stages, 5).
+    """
 
     last: Floats
-    """State z at the end, shape (n, 7)."""
     last_c: Floats
-    """Sensitivity of the last state, shape (n, 7, corrections)."""
     outputs: Floats
-    """Radius error, inputs and moves of each stage, shape (n, stages, 5)."""
     outputs_c: Floats
-    """Sensitivity of the outputs, shape (n, stages, 5, corrections)."""
 
-    def of(self, slots: npt.NDArray[np.bool_]) -> Prediction:
+    def of(self, slots: npt.NDArray[np.bool_]) -> Self:
         """The prediction of some slots."""
-        return Prediction(*(part[slots] for part in self))
+        return type(self)(*(part[slots] for part in self))
 
 
 @dataclass(frozen=True)
@@ -122,10 +115,7 @@ class EkfMpc(LQG):
         return limits_of(self.actuators, (self.v_0, self.heater_range), self.control_interval)
 
     def law(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
-        """The best inputs [m/s, W], deviations, shape (n, 2); the LQG's own in slots where the prediction fails.
-
-        Arguments are those of :meth:`cz_gym.baselines.lqg.controller.LQG.law`.
-        """
+        """The best inputs, as :meth:`LQG.law` returns them, whose own stand in slots where the prediction fails."""
         gains, shape, scale = self.gains, self.shape, SCALES[PLANT:]
         share = self.design.noise.recipe_share
         disturbances = expected_disturbances(estimate, plan, gains, share, shape.stages)

@@ -1,7 +1,7 @@
 """The interface that controllers and agents share: stable-baselines3's ``predict``, for a batch of crystals at once."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
@@ -16,6 +16,7 @@ from cz_gym.machine.puller import DEFAULT, PullerFile
 from cz_gym.observation import Measured, decode, readable
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
+from cz_gym.support.nested import select
 
 Floats = npt.NDArray[np.float64]
 
@@ -30,11 +31,7 @@ class Policy(Protocol):
     """
 
     def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[npt.NDArray[np.float32], Any]:
         """Return the action and the next state."""
         ...
@@ -95,13 +92,8 @@ class MeasuredController(ABC):
         """The environment that takes its actions; None: every one does."""
         if self.any_environment:
             return None
-        return Config(
-            action=self.action,
-            control_interval=self.control_interval,
-            parameters=self.parameters,
-            meniscus=self.meniscus,
-            puller=self.puller,
-        ).made_for
+        plant: dict[str, Any] = {"parameters": self.parameters, "meniscus": self.meniscus, "puller": self.puller}
+        return Config(action=self.action, control_interval=self.control_interval, **plant).made_for
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -114,13 +106,8 @@ class MeasuredController(ABC):
 
     def for_config(self, config: Config) -> Self:
         """The same controller for the control interval and the puller of an environment."""
-        return replace(
-            self,
-            control_interval=config.control_interval,
-            parameters=config.parameters,
-            meniscus=config.meniscus,
-            puller=config.puller,
-        )
+        names = "control_interval", "parameters", "meniscus", "puller"
+        return replace(self, **{name: getattr(config, name) for name in names})
 
     @abstractmethod
     def at_rest(self, seen: Measured) -> Any:
@@ -182,23 +169,6 @@ def fresh(state: Any, zeros: Any, episode_start: Any) -> Any:
         return state
     begins = np.atleast_1d(np.asarray(episode_start, np.bool_))
     return select(begins, zeros, state) if begins.any() else state
-
-
-def select(where: npt.NDArray[np.bool_], one: Any, other: Any) -> Any:
-    """``one`` in the slots where ``where`` is true, ``other`` elsewhere; both nested tuples of arrays."""
-    return map_arrays(lambda a, b: np.where(where.reshape(-1, *(1,) * (b.ndim - 1)), a, b), one, other)
-
-
-def map_arrays(function: Callable[..., Any], *values: Any) -> Any:
-    """The nested NamedTuple of the function's results for the arrays of ``values``, which are nested alike."""
-    if isinstance(values[0], tuple):
-        return type(values[0])(*(map_arrays(function, *parts) for parts in zip(*values, strict=True)))
-    return function(*values)
-
-
-def stack(values: Sequence[Any]) -> Any:
-    """NamedTuples of one kind as one NamedTuple of arrays, with a new leading axis."""
-    return map_arrays(lambda *parts: np.stack(parts), *values)
 
 
 def check_numbers(owner: Any, positive: Sequence[str] = (), not_negative: Sequence[str] = ()) -> None:

@@ -43,12 +43,8 @@ def report(results: Sequence[Result], runs: Runs) -> dict[str, bytes]:
         summary(results),
         markdown(("a training", "million steps", "minutes", "training seeds"), spent),
     ])  # fmt: skip
-    rows = [
-        {"variant": name, "seed": seed, **row}
-        for name, seeds in runs.items()
-        for seed, progress in seeds.items()
-        for row in progress
-    ]
+    listed = ((name, seed, rows) for name, seeds in runs.items() for seed, rows in seeds.items())
+    rows = [{"variant": name, "seed": seed, **row} for name, seed, progress in listed for row in progress]
     drawn = curves({name: [*seeds.values()] for name, seeds in runs.items()})
     return {"table.md": f"{text}\n".encode(), "curves.png": drawn, "curves.csv": to_csv(rows)}
 
@@ -75,10 +71,9 @@ def _compare(given: argparse.Namespace) -> None:
     policies: dict[str, list[OnnxPolicy]] = {}
     for folder in folders:
         policy = OnnxPolicy.load(folder / "agent.onnx")
-        policies.setdefault(policy.contract.algorithm, []).append(policy)
-        runs.setdefault(policy.contract.algorithm, {})[policy.contract.training_seed] = read_rows(
-            folder / "progress.csv"
-        )
+        name, seed = policy.contract.algorithm, policy.contract.training_seed
+        policies.setdefault(name, []).append(policy)
+        runs.setdefault(name, {})[seed] = read_rows(folder / "progress.csv")
     agents = [agent(name, trained) for name, trained in policies.items()]
     results = run(agents, random_rows(JUDGING[0]), len(JUDGING), given.out)
     write_files({given.out / name: content for name, content in report(results, runs).items()})

@@ -95,10 +95,11 @@ def _main(given: argparse.Namespace) -> None:
     print(table(heads, rows))
     if not stable:
         print("the closed loop is unstable: it has no margins")
-    zones = [
-        (name, *stable_range(form.controller, form.dt, of, given.mix, own.parameters)) for name, of in HOT_ZONE.items()
-    ]
-    print(table(("factor on", "stable from", "to"), [(name, f"{low:.2f}", f"{high:.2f}") for name, low, high in zones]))
+    zones = []
+    for name, of in HOT_ZONE.items():
+        low, high = stable_range(form.controller, form.dt, of, given.mix, own.parameters)
+        zones.append((name, f"{low:.2f}", f"{high:.2f}"))
+    print(table(("factor on", "stable from", "to"), zones))
     write_files({given.out: picture(given.controller, form.dt, loops)})
     print(f"wrote {given.out}")
 

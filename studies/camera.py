@@ -1,7 +1,6 @@
-"""Three readings of the bright ring, compared and drawn in about a minute: ``python -m studies.camera``.
+"""Three readings of the bright ring of the same crystals, compared and drawn: ``python -m studies.camera``.
 
-The readings are of the same crystals: the plant's closed-form ring, the ring's outer edge traced without pixels, and
-what the detector reads from an image.
+They are the plant's closed form, the ring's outer edge traced without pixels, and the detector's, from an image.
 """
 
 import argparse
@@ -60,10 +59,7 @@ class Response(NamedTuple):
 
 
 def read_rings(detector: RingDetector, r_c: Any, h_c: Any, images: Any = None) -> dict[str, Floats]:
-    """The three readings of crystals of radius r_c on menisci of height h_c [m], less those at rest.
-
-    r_c and h_c broadcast. ``images`` of the crystals, in order, are traced unless given.
-    """
+    """The readings at radius r_c and height h_c [m], less those at rest, of ``images`` or of traced ones."""
     r, h = np.broadcast_arrays(r_c, h_c)
     pairs = list(zip(r.ravel().tolist(), h.ravel().tolist(), strict=True))
     shown = [picture(*pair, PULLER, VIEW) for pair in pairs] if images is None else images

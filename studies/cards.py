@@ -37,32 +37,21 @@ Results = Mapping[str, Mapping[str, Mapping[str, Estimate]]]
 
 def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -> str:
     """An agent's section."""
-    first = contracts[0]
-    rows = [
-        [scenario, *(column.text(of[name][column.metric]) for column in FIGURES)] for scenario, of in results.items()
-    ]
+    first, taken = contracts[0], sorted(contract.training_steps / 1e6 for contract in contracts)
+    steps = " to ".join(dict.fromkeys(f"{each:.0f}" for each in (taken[0], taken[-1])))
+    rows = [[where, *(column.text(of[name][column.metric]) for column in FIGURES)] for where, of in results.items()]
     fails = [f"`{scenario}`" for scenario, of in results.items() if of[name]["failure_rate"].mean > 0.0]
     return "\n".join(
         [
-            f"## `{name}`",
-            "",
+            f"## `{name}`\n",
             f"- How it learned: {how}.",
-            f"- Saw: crystals of {first.scenario}; kept after {_steps(contracts)}.",
+            f"- Saw: crystals of {first.scenario}; kept after {steps} million steps.",
             f"- Reads: `{first.observation}`; acts every {first.control_interval:g} s; its action is `{first.action}`.",
             f"- Training seeds: {len(contracts)}. `agents.load({name!r})` is the one of least validation cost.",
             "- Fails: " + (f"loses crystals of {', '.join(fails)}." if fails else "on none of these."),
-            "",
-            table(["scenario", *(column.heading for column in FIGURES)], rows),
-            "",
+            "\n" + table(["scenario", *(column.heading for column in FIGURES)], rows) + "\n",
         ]
     )
-
-
-def _steps(contracts: Sequence[Contract]) -> str:
-    """Number of environment steps after which its runs kept it."""
-    taken = [contract.training_steps / 1e6 for contract in contracts]
-    steps = [f"{least_or_most(taken):.0f}" for least_or_most in (min, max)]
-    return f"{' to '.join(dict.fromkeys(steps))} million steps"
 
 
 ABOUT = """# Model cards

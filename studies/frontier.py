@@ -1,11 +1,7 @@
 """Radius errors over the LQG's at equal pull activity: ``python -m studies.frontier benchmark.json``.
 
-Returns stand beside them: Spearman's correlation of return and ratio, over the controllers that are no bounds, says how
-well the reward ranks them.
-
 The LQG's settings (:data:`cz_gym.baselines.tuning.lqg.FAMILY`) are the reference family of
-:mod:`cz_gym.evaluation.equal_activity`. With ``episodes.csv`` beside the file, each ratio has a 95 % bootstrap interval
-over crystals and training seeds.
+:mod:`cz_gym.evaluation.equal_activity`. With ``episodes.csv`` beside it, each ratio has a 95 % bootstrap interval.
 """
 
 import argparse
@@ -41,10 +37,7 @@ Means = Mapping[str, Mapping[str, Estimate]]
 
 
 def ranking(means: Means, found: Mapping[str, float]) -> str:
-    """Sentences: how well the return ranks the controllers as the ratios ``found`` do.
-
-    The reference family is left out of the first: its members' ratios are 1 by definition, whatever their returns.
-    """
+    """Sentences: how well the return ranks the controllers that are no bounds as the ratios ``found`` do."""
     names = [name for name in found if name not in BOUNDS]
     others = [name for name in names if name not in FAMILY]
     if len(others) < 3:

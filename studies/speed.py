@@ -11,8 +11,8 @@ import sys
 import timeit
 from collections.abc import Callable, Mapping
 from functools import partial
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -79,13 +79,14 @@ def cases(quick: bool) -> dict[str, Callable[[], Any]]:
     rows["step without derivatives"] = partial(differentiable, False)
     rows["step with derivatives"] = partial(differentiable, True)
     rows["pc-gym CSTR"] = _pcgym
-    rows["SB3 adapter over the batch"] = lambda: import_module("cz_gym.sb3").make_vec_env(SB3_SLOTS)
+    rows["SB3 adapter over the batch"] = partial(_call, "cz_gym.sb3:make_vec_env", SB3_SLOTS)
     for name in ("cz_gym:Cz-v0", "Pendulum-v1"):
-        rows[f"SB3 make_vec_env, {name}"] = partial(_sb3_make_vec_env, name)
+        rows[f"SB3 make_vec_env, {name}"] = partial(_call, "stable_baselines3.common.env_util:make_vec_env", name, 16)
         rows[f"SyncVectorEnv, {name}"] = partial(gym.make_vec, name, num_envs=4, vectorization_mode="sync")
-    rows["SB3 DummyVecEnv"] = partial(_sb3, "DummyVecEnv", SB3_SLOTS)
+    ours, kinds = partial(gym.make, "cz_gym:Cz-v0"), "stable_baselines3.common.vec_env:"
+    rows["SB3 DummyVecEnv"] = partial(_call, f"{kinds}DummyVecEnv", [ours] * SB3_SLOTS)
     for n in (2,) if quick else (2, 16):
-        rows[f"SB3 SubprocVecEnv, {n} processes"] = partial(_sb3, "SubprocVecEnv", n)
+        rows[f"SB3 SubprocVecEnv, {n} processes"] = partial(_call, f"{kinds}SubprocVecEnv", [ours] * n)
     rows["Cz-v0 scalar, camera"] = partial(CzEnv, "nominal", observation="camera")
     return rows
 
@@ -116,10 +117,7 @@ def batched(env: Any, num_envs: int) -> Stepper:
 
 
 def our_batch(num_envs: int, threads: int, resets: bool = True) -> Stepper:
-    """The native batch, its slots at random steps of their episodes, so that resets are spread out.
-
-    Without ``resets`` it repeats the same first minutes, to be compared with the bare loop.
-    """
+    """The native batch at random steps of its episodes; without ``resets`` it repeats the same first minutes."""
     env = CzVectorEnv(num_envs, observation="measured", threads=threads)
     env.reset(seed=0)
     if not resets:
@@ -158,8 +156,8 @@ def differentiable(derivatives: bool) -> Stepper:
 
 
 def _envpool(num_envs: int, threads: int) -> Stepper:
-    envpool = import_module("envpool")
-    env = envpool.make("Pendulum-v1", env_type="gymnasium", num_envs=num_envs, num_threads=threads)
+    make = resolve_name("envpool:make")
+    env = make("Pendulum-v1", env_type="gymnasium", num_envs=num_envs, num_threads=threads)
     env.reset()
     return batched(env, num_envs)
 
@@ -167,7 +165,7 @@ def _envpool(num_envs: int, threads: int) -> Stepper:
 def _pcgym() -> Any:
     """The CSTR of pc-gym's documentation: three states, one input, 100 steps of 0.26 min."""
     box = {"low": np.array([0.7, 300.0, 0.8]), "high": np.array([1.0, 350.0, 0.9])}
-    return import_module("pcgym").make_env(
+    return resolve_name("pcgym:make_env")(
         {
             "N": 100, "tsim": 26, "SP": {"Ca": [0.85] * 50 + [0.9] * 50}, "o_space": box,
             "a_space": {"low": np.array([295.0]), "high": np.array([302.0])},
@@ -178,13 +176,9 @@ def _pcgym() -> Any:
     )  # fmt: skip
 
 
-def _sb3_make_vec_env(name: str) -> Any:
-    return import_module("stable_baselines3.common.env_util").make_vec_env(name, 16)
-
-
-def _sb3(kind: str, num_envs: int) -> Any:
-    make = getattr(import_module("stable_baselines3.common.vec_env"), kind)
-    return make([partial(gym.make, "cz_gym:Cz-v0")] * num_envs)
+def _call(place: str, *arguments: Any) -> Any:
+    """Call ``module:function`` of a package that may be missing."""
+    return resolve_name(place)(*arguments)
 
 
 def measure(wanted: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, Any]:

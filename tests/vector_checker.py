@@ -55,10 +55,7 @@ class Driver:
             raise NotConforming(f"[{self.mode.value}] {message}")
 
     def run(self, env: Any, counts: bool = False, overwrites: bool = False) -> Iterator[Event]:
-        """Reset and step with sampled actions; where the mode is ``DISABLED``, reset the slots that ended.
-
-        ``overwrites`` overwrites each action after its step.
-        """
+        """Reset and step with sampled actions, which ``overwrites`` spoils; if ``DISABLED``, reset ended slots."""
         env.action_space.seed(self.seed)
         over, none = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.bool_)
         yield Event("reset", env.reset(seed=self.seed), ~none)
@@ -169,10 +166,7 @@ def _check_equality(driver: Driver, random_start: bool) -> None:
 
 
 def _check_kept(driver: Driver, every: bool) -> None:
-    """Keep every array, or one of each call alone, each in another way; all must be unchanged at the end.
-
-    One alone, because an environment that recycles arrays nobody holds would find the others free.
-    """
+    """Keep every array, or one of each call (the others may be recycled): all must be unchanged at the end."""
     kept: list[tuple[str, str, Callable[[], bool]]] = []
     with driver.vector() as env:
         for number, event in enumerate(driver.run(env)):
@@ -219,10 +213,7 @@ def flatten(value: Any, name: str = "") -> list[NamedArray]:
 
 
 def difference(one: Sequence[NamedArray], other: Sequence[NamedArray], masked: bool = False) -> str | None:
-    """The first difference, in words; None if there is none.
-
-    ``masked`` compares only where the masks are true, and allows other dtypes except for bool, as infos have them.
-    """
+    """The first difference in words, or None; ``masked`` compares infos where masks are true, of any dtype but bool."""
     names = [[array.name for array in arrays] for arrays in (one, other)]
     if names[0] != names[1]:
         odd = sorted(set(names[0]) ^ set(names[1]))
@@ -259,10 +250,7 @@ KEEPERS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], bytes]]] = {
 
 
 def keep(array: NamedArray, number: int) -> tuple[str, Callable[[], bool]]:
-    """Keep an array in way ``number`` modulo their count, or as itself where that way is impossible.
-
-    Returns its name with the way, and a function that says whether it shows the same bytes still.
-    """
+    """The array's name and the way, by ``number``, it is kept in, and whether it shows the same bytes still."""
     value = array.value
     simple = value.ndim > 0 and value.size > 0 and value.flags.c_contiguous and value.flags.writeable
     way = list(KEEPERS)[number % len(KEEPERS) if simple else 0]

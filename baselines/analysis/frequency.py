@@ -59,10 +59,7 @@ def loop_margins(
     stable: bool | None = None,
     points: int = 2000,
 ) -> LoopMargins:
-    """Margins of the loop opened there; if the closed loop is not ``stable``, all but the crossover are NaN.
-
-    ``stable`` may be given where it is known, or that of another controller counts; ``points`` is the grid's.
-    """
+    """Margins of the loop opened there, on a grid; all but the crossover are NaN if it is not ``stable``."""
     import control
 
     omega = frequencies(dt, points)

@@ -7,12 +7,13 @@ import numpy as np
 
 from cz_gym.baselines.lqg.controller import LQG
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.policy import OpenLoop, map_arrays
+from cz_gym.baselines.policy import OpenLoop
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Sensor
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import HEATER_SCALE, MEASURED, PULL_SCALE, Measured, scales
 from cz_gym.physics.linearisation import StateSpace
+from cz_gym.support.nested import map_arrays
 
 from .sampled_loop import NotLinearError, linear_controller
 

@@ -15,13 +15,14 @@ from scipy.optimize import bisect
 from scipy.signal import cont2discrete
 
 from cz_gym.action import HEATER_RANGE
-from cz_gym.baselines.policy import Floats, State, map_arrays
+from cz_gym.baselines.policy import Floats, State
 from cz_gym.body.linearisation import OUTPUTS, STATES, linearise
 from cz_gym.body.plant import Puller, make_puller
 from cz_gym.errors import CzError
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured, scales
 from cz_gym.physics.linearisation import StateSpace
 from cz_gym.physics.parameters import Parameters
+from cz_gym.support.nested import map_arrays
 
 _SMALL = 1e-6
 """Observed amplitude below every limit, gate and dead zone [-]; float32 actions keep their relative precision."""
@@ -175,10 +176,7 @@ def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -
 def stable_range(
     controller: StateSpace, dt: float, parameter: str, lam: float, nominal: Parameters = _NOMINAL
 ) -> tuple[float, float]:
-    """The range of a factor on that parameter of a puller, around 1, in which the closed loop is stable.
-
-    It ends at 1/WIDEST and WIDEST; both ends are NaN if the loop is unstable with the puller as it is.
-    """
+    """Range of a factor on that parameter, at most 1/WIDEST to WIDEST, in which the loop is stable; NaN if not at 1."""
 
     def stable(factor: float) -> bool:
         puller = make_puller(nominal._replace(**{parameter: factor * getattr(nominal, parameter)}), lam)

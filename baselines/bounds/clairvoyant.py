@@ -1,11 +1,8 @@
 """The lowest bound: the optimal trajectory for known parameters, state and future disturbances.
 
-The trajectory is optimised before the episode, for the reward's own cost (:mod:`cz_gym.baselines.bounds.trajectory`).
-During the episode its inputs are applied. The optimum's own feedback on the true state corrects what the plan does not
-contain: a heater that moves in steps.
+Its inputs are applied; the optimum's own feedback on the true state corrects what the plan does not contain: a heater
+that moves in steps.
 """
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,11 +39,8 @@ class Clairvoyant:
     hash = ""
     """Hash of its settings, of which there are none."""
 
-    def for_episodes(self, config: Config, seeds: Sequence[int]) -> OptimalInputs:
-        """The optimal inputs of the first episode of each seed; CzError names the seeds whose optimum is not reached.
-
-        One episode a slot, in the order of the seeds.
-        """
+    def for_episodes(self, config: Config, seeds: Sequence[int]) -> "OptimalInputs":
+        """The optimal inputs of each seed's first episode, one a slot; CzError names the seeds that have none."""
         future = future_of(config, seeds)
         limits = limits_of(config.sole_scenario.actuators, config.ranges, config.control_interval)
         best = optimise(future, limits)

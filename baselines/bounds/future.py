@@ -1,7 +1,4 @@
-"""The future of an episode: its puller, its start, its reference and every disturbance to come.
-
-It comes from the environment's own draws and schedules, and is for bounds only; no controller may read it.
-"""
+"""The future of an episode, from the environment's own draws and schedules, which only bounds may read."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.baselines.policy import Floats, stack
+from cz_gym.baselines.policy import Floats
 from cz_gym.body.plant import Disturbance, Inputs, Puller, State, disturbance, make_puller, rk4
 from cz_gym.config import Config
 from cz_gym.engine.batch import Key, first_key
@@ -18,6 +15,7 @@ from cz_gym.episodes.record import GRID
 from cz_gym.episodes.schedule import bias_offset, reference
 from cz_gym.episodes.series import draw_episode, draw_factors, new_series
 from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.support.nested import stack
 
 _EPS = 1e-9
 

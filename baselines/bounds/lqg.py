@@ -1,7 +1,6 @@
 """Privileged LQGs: bounds on the worth of a perfect model, and of a perfect view of the present.
 
-They know what no controller can know, and stand in tables as bounds, never as contenders. Their method
-``for_episodes``, which a rollout calls, gives them this knowledge of the episodes that it is about to run.
+Their method ``for_episodes``, which a rollout calls, tells them of the episodes what no controller can know.
 """
 
 import math
@@ -37,8 +36,8 @@ _TINY = 1e-9
 class PrivilegedLQG(LQG):
     """The LQG with each slot's own puller as its model: a bound on the worth of the parameters.
 
-    With ``knows_fluctuations`` its filter also has the strength of each crystal's interface fluctuations, where other
-    LQGs assume the average. Before ``for_episodes`` it is the LQG of the nominal puller.
+    With ``knows_fluctuations`` its filter has the strength of each crystal's interface fluctuations too. Before
+    ``for_episodes`` it is the LQG of the nominal puller.
     """
 
     gains_by_slot: Gains | None = None
@@ -60,15 +59,11 @@ class PrivilegedLQG(LQG):
         """The same controller for those episodes, one a slot."""
         designs = [self.design] * len(seeds)
         if self.knows_fluctuations:
-            designs = [_with_fluctuations(self.design, *each) for each in fluctuations_of(config, seeds)]
+            sds = np.maximum(fluctuations_of(config, seeds), _LEAST_SD).tolist()
+            noises = [replace(self.design.noise, fast_sd=fast, slow_sd=slow) for fast, slow in sds]
+            designs = [replace(self.design, noise=noise) for noise in noises]
         solved = solve_each(designs, config.control_interval, pullers_of(config, seeds), config.meniscus)
         return replace(self, gains_by_slot=solved)
-
-
-def _with_fluctuations(design: LQGDesign, fast: float, slow: float) -> LQGDesign:
-    """The design for fluctuations of those standard deviations [K]."""
-    noise = replace(design.noise, fast_sd=max(fast, _LEAST_SD), slow_sd=max(slow, _LEAST_SD))
-    return replace(design, noise=noise)
 
 
 class Exact(NamedTuple):
@@ -81,8 +76,7 @@ class Exact(NamedTuple):
 class TrueState(NamedTuple):
     """A filter that sees the state and the present disturbances.
 
-    Only the sum of the two interface fluctuations is seen: a noise-free Kalman filter of two states separates them.
-    The drift is the one whose static load is seen, its rate the last change.
+    It separates the two interface fluctuations, of which the sum is seen, by a noise-free Kalman filter.
     """
 
     models: PlantFilter

@@ -1,10 +1,7 @@
 """The optimal trajectory of an episode with a known future: Newton steps by Riccati sweeps, limits by interior points.
 
-Direct multiple shooting (Bock and Plitt 1984): states and inputs of all steps are unknowns. The dynamics of all steps
-are linearised at once, by complex step through the environment's own equations. One Riccati sweep back and one forward
-solve the banded problem, in a time that grows with the number of steps, not its cube. A primal-dual barrier keeps the
-drives' limits (Wright 1997). The cost is quadratic, so leaving out the dynamics' curvature (Gauss-Newton) costs a
-little speed and no accuracy.
+Direct multiple shooting (docs/controllers/bounds.md): all steps are linearised at once, by complex step through the
+environment's own equations, and solved in a time that grows with their number, not its cube.
 """
 
 import math
@@ -39,30 +36,21 @@ _STEP = 1e-30
 class Stages(NamedTuple):
     """The problem of a Newton step: N stages for n slots, diagonal costs.
 
-    Minimise sum_k 1/2 z' Q z + q' z (after each stage) + 1/2 w' R w + r' w with z_{k+1} = A z_k + B w_k + c_k.
+    Minimise sum_k 1/2 z' Q z + q' z (after each stage) + 1/2 w' R w + r' w with z_{k+1} = A z_k + B w_k + c_k. A has
+    shape (N, n, states, states), B (N, n, states, inputs), c, Q and q (N, n, states), R and r (N, n, inputs).
     """
 
     A: Floats
-    """Shape (N, n, states, states)."""
     B: Floats
-    """Shape (N, n, states, inputs)."""
     c: Floats
-    """Constant term of the next state, shape (N, n, states)."""
     Q: Floats
-    """Curvature of the cost by the state after the stage, shape (N, n, states)."""
     q: Floats
-    """Slope of the cost by the state after the stage, shape (N, n, states)."""
     R: Floats
-    """Curvature of the cost by the stage's input, shape (N, n, inputs)."""
     r: Floats
-    """Slope of the cost by the stage's input, shape (N, n, inputs)."""
 
 
 def sweep_back(stages: Stages) -> tuple[Floats, Floats]:
-    """The law that is optimal for every starting state: w_k = feedback_k z_k + forward_k.
-
-    feedback has shape (N, n, inputs, states), forward (N, n, inputs).
-    """
+    """The optimal law w_k = feedback_k z_k + forward_k, of shapes (N, n, inputs, states) and (N, n, inputs)."""
     N, n, states, inputs = stages.B.shape
     feedback, forward = np.empty((N, n, inputs, states)), np.empty((N, n, inputs))
     P, p = np.zeros((n, states, states)), np.zeros((n, states))
@@ -96,8 +84,7 @@ def sweep_forward(stages: Stages, feedback: Floats, forward: Floats) -> tuple[Fl
 
 
 def _times(matrix: Floats, vector: Floats) -> Floats:
-    product: Floats = (matrix @ vector[..., None])[..., 0]
-    return product
+    return (matrix @ vector[..., None])[..., 0]
 
 
 class Limits(NamedTuple):
@@ -152,7 +139,8 @@ def optimise(future: Future, limits: Limits) -> Trajectory:
         feedback, forward = sweep_back(stages)
         after, moves = sweep_forward(stages, feedback, forward)
         dz = after * SCALES
-        ds = _slopes(after[:, :, STATES:], moves)
+        held = after[:, :, STATES:]
+        ds = np.stack([-held, held, -moves, moves])
         df = barrier / slack - force - force / slack * ds
         fraction = np.minimum(_step_fraction(slack, ds), _height_fraction(x[1:, :, 1], dz[:, :, 1], future))
         x[1:] += fraction[:, None] * dz[:, :, :STATES]
@@ -218,11 +206,6 @@ def _slacks(u: Floats, nominal: Floats, limits: Limits) -> Floats:
     held = (u - nominal) / SCALES[STATES:]
     moves = np.diff(u, axis=0, prepend=nominal[None]) / SCALES[STATES:]
     return np.stack([limits.span - held, limits.span + held, limits.move - moves, limits.move + moves])
-
-
-def _slopes(held: Floats, moves: Floats) -> Floats:
-    """Changes of the slacks with inputs and moves."""
-    return np.stack([-held, held, -moves, moves])
 
 
 def _step_fraction(values: Floats, changes: Floats) -> Floats:

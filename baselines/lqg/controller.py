@@ -1,10 +1,4 @@
-"""Linear-quadratic-Gaussian control of pull speed and heater together.
-
-An extended Kalman filter (:mod:`cz_gym.baselines.lqg.estimator`), or a bank of them, estimates the augmented plant
-(:mod:`cz_gym.baselines.lqg.model`). A regulator with costs on input moves and five minutes of recipe preview acts on
-the estimate (:mod:`cz_gym.baselines.lqg.regulator`). The filter's inputs are the ones that the drives applied, so
-limits and slew rates never wind anything up.
-"""
+"""Linear-quadratic-Gaussian control of pull speed and heater together: filter, regulator and their design."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,11 +7,12 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from cz_gym.baselines.policy import Floats, MeasuredController, stack
+from cz_gym.baselines.policy import Floats, MeasuredController
 from cz_gym.body.cost import WEIGHTS, Weights
 from cz_gym.body.plant import Puller, make_puller
 from cz_gym.observation import Measured
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.support.nested import stack
 from cz_gym.support.units import KILO
 
 from .estimator import PlantFilter

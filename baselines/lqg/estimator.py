@@ -1,22 +1,20 @@
 """The LQG's state estimator: an extended Kalman filter of the augmented plant on bright ring and pyrometer.
 
 The mean is predicted with the plant's own equations (or, with ``nonlinear=False``, with the linearised ones), the
-covariance with the linearised plant. The ring's slope is taken at the estimated meniscus, because a growing radius
-nearly doubles it and halves the right-half-plane zero. The camera's noise is estimated from the innovations.
+covariance with the linearised plant, the ring's slope taken at the estimated meniscus (docs/controllers/lqg.md).
 """
-
-from __future__ import annotations
 
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.baselines.policy import Floats, select
+from cz_gym.baselines.policy import Floats
 from cz_gym.body.plant import Disturbance, Inputs, State, hidden_load, rk4
 from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, radius_limit
 from cz_gym.observation import Measured
 from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.support.nested import select
 from cz_gym.support.units import KILO, MINUTE
 
 from . import kalman, ring_model
@@ -50,10 +48,7 @@ SURPRISE_MEMORY = 10.0 * MINUTE
 
 
 class PlantFilter(NamedTuple):
-    """The filter of one puller, or of one puller a slot.
-
-    With one a slot, fields of ``puller`` have shape (n,) and arrays of ``plant`` a leading axis n.
-    """
+    """The filter of one puller, or of one a slot: then ``puller`` and ``plant`` have a leading axis n."""
 
     puller: Any
     plant: PlantModel
@@ -90,7 +85,7 @@ class PlantFilter(NamedTuple):
             mean[:, :PLANT] = self._moved_plant(state.mean, applied)
         mean[:, DRIFT] += drift_moved
         if self.ring is None:
-            covariance = kalman.predicted_covariance(state.covariance, self.plant.A, self.plant.Q)
+            covariance = self.plant.A @ state.covariance @ np.swapaxes(self.plant.A, -1, -2) + self.plant.Q
         else:
             mean[:, RIPPLE:], covariance = self._moved_ring(state, self.ring)
         return state._replace(mean=self._clipped(mean), covariance=covariance)
@@ -164,7 +159,7 @@ class PlantFilter(NamedTuple):
         mean = (A @ state.mean[..., None])[..., 0]
         if ring.first_past < mean.shape[1]:
             mean[:, ring.first_past] = now
-        covariance = kalman.predicted_covariance(state.covariance, A, self.plant.Q)
+        covariance = A @ state.covariance @ np.swapaxes(A, -1, -2) + self.plant.Q
         if ring.has_ripple:
             covariance = _without_ripple(covariance, state.ripple.omega == 0.0)
         return mean[:, RIPPLE:], covariance

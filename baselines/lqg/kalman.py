@@ -1,20 +1,9 @@
-"""An extended Kalman filter for a batch of slots, one scalar measurement at a time.
-
-Every slot has its own covariance, because episodes start, frames are missing, the ring's slope changes with the
-meniscus, and the camera's noise is unknown. On a linear plant with constant noise the filter settles at the solution of
-the Riccati equation.
-"""
+"""An extended Kalman filter for a batch of slots, each with its own covariance, one scalar measurement at a time."""
 
 import numpy as np
 import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats
-
-
-def predicted_covariance(P: Floats, A: Floats, Q: Floats) -> Floats:
-    """A P A' + Q for P of shape (n, states, states); A and Q have the same shape or are shared by the slots."""
-    predicted: Floats = A @ P @ np.swapaxes(A, -1, -2) + Q
-    return predicted
 
 
 def correct(
@@ -24,8 +13,7 @@ def correct(
 
     ``innovation`` is the measured less the expected value, shape (n,), ``row`` (h) the derivative of the expected value
     by the state, shape (n, states), ``variance`` (R) that of the noise, infinite where nothing was measured.
-    Innovations are clipped to +-``gate`` standard deviations (Huber's limit): an outlier does little harm, and a real
-    change is still followed.
+    Innovations are clipped to +-``gate`` standard deviations (Huber's limit).
     """
     Ph = (P @ row[..., None])[..., 0]
     S = expected_variance(P, row) + variance

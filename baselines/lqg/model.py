@@ -6,8 +6,6 @@ Ornstein-Uhlenbeck process, so the drift is a slowly bending ramp), and an unkno
 removes the offset between T_1 and the pyrometer). The drift also follows a share of the recipe's known movement.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -69,18 +67,17 @@ class NoiseModel:
 
 
 class PlantModel(NamedTuple):
-    """x_{k+1} = A x_k + B u_k + w_k, y_k = H x_k + v_k with u = (v_p, Q_H) and y = (r_br, T_1); SI units."""
+    """x_{k+1} = A x_k + B u_k + w_k, y_k = H x_k + v_k with u = (v_p, Q_H) and y = (r_br, T_1); SI units.
+
+    A has shape (10, 10), B (10, 2), H (2, 10). Q is the covariance of w over one interval, ``start`` that of x at the
+    start of an episode.
+    """
 
     A: Floats
-    """Shape (10, 10)."""
     B: Floats
-    """Shape (10, 2)."""
     H: Floats
-    """Shape (2, 10)."""
     Q: Floats
-    """Covariance of w over one interval, shape (10, 10)."""
     start: Floats
-    """Covariance of x at the start of an episode, shape (10, 10)."""
 
 
 def load_per_drift(puller: Puller) -> Any:

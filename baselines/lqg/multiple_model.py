@@ -1,9 +1,7 @@
 """Multiple-model estimation: a bank of the LQG's filters, weighted by how well each predicts the ring.
 
-Crystals differ in the strength of their interface fluctuations. A filter made for the average trusts its camera too
-little where they are strong and too much where they are weak. Each filter of the bank assumes one pair of standard
-deviations. Bayes' rule on the ring's innovations gives its probability (Magill 1965), and the estimate is the mean over
-the filters.
+Each filter assumes one pair of standard deviations of the interface fluctuations, whose strength differs from crystal
+to crystal. Bayes' rule gives its probability (Magill 1965), and the estimate is the mean over the filters.
 """
 
 from dataclasses import dataclass, replace
@@ -13,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.baselines.policy import Floats, map_arrays, select
+from cz_gym.baselines.policy import Floats
 from cz_gym.observation import Measured
+from cz_gym.support.nested import map_arrays, select
 
 from .estimator import FilterState, PlantFilter
 from .model import plant_model

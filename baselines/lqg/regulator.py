@@ -1,8 +1,7 @@
 """Linear-quadratic regulator with costs on input moves, known disturbances and a previewed reference.
 
-Its states are the plant's five and the previous inputs (v, q); its inputs are the moves of both. The cost is the
-reward's, before it saturates. The disturbance states, which drive the plant and are not moved by it, enter by a
-Sylvester equation: in the Riccati equation an integrating disturbance would be unstabilisable.
+The disturbance states, which drive the plant and are not moved by it, enter by a Sylvester equation: in the Riccati
+equation an integrating disturbance would be unstabilisable.
 """
 
 from typing import NamedTuple
@@ -26,25 +25,19 @@ class Regulator(NamedTuple):
 
     dr_ref_j [m] and dp_j [K] are the known increments from t + j dt to t + (j + 1) dt. The least cost from
     z = (plant's five states, previous inputs) and disturbance states d on is z' P z + 2 z' X d, up to terms in d alone.
+    ``feedback`` has shape (2, 12): the augmented plant's ten states, then the previous inputs; ``reference`` and
+    ``drift`` have shape (samples ahead, 2), P (7, 7), X (7, 5).
     """
 
     feedback: Floats
-    """Shape (2, 12): the augmented plant's ten states, then the previous inputs."""
     reference: Floats
-    """Shape (samples ahead, 2)."""
     drift: Floats
-    """Shape (samples ahead, 2)."""
     P: Floats
-    """Shape (7, 7)."""
     X: Floats
-    """Shape (7, 5)."""
 
 
 def quadratic_cost(weights: Weights, dt: float) -> tuple[Floats, Floats, Floats]:
-    """Q, N and R of the cost sum z' Q z + 2 z' N du + du' R du for a control interval of dt [s].
-
-    z has the plant's five states and the previous inputs.
-    """
+    """Q, N and R of the cost sum z' Q z + 2 z' N du + du' R du, z = (plant's states, previous inputs), for dt [s]."""
     Q, N = np.zeros((PLANT + 2, PLANT + 2)), np.zeros((PLANT + 2, 2))
     per_square = coefficients(weights)
     per_step = (STEP_TIME / dt) ** 2

@@ -1,8 +1,7 @@
 """A camera with latency and a ring that ripples with the crystal's rotation, as states of the LQG's plant model.
 
-Latency: the rings of past samples are states, so a frame some seconds old corrects the state of that time. Ripple: an
-oscillator of two states with a slowly wandering phase (a narrow-band process), at the rotation's frequency, aliased by
-sampling. This frequency is unknown; it is found as the peak in the spectrum of the ring's residual.
+Latency: the rings of past samples are states. Ripple: an oscillator with a slowly wandering phase, at the rotation's
+frequency, aliased by sampling, which is found as the peak in the spectrum of the ring's residual.
 """
 
 import math
@@ -103,8 +102,7 @@ def undelayed_row(model: PlantModel, ring: RingModel, dt: float) -> Floats:
 def oscillator(omega: Floats, ring: RingModel, dt: float) -> Floats:
     """Transition of the ripple's two states over dt [s] at frequencies omega [rad/s], shape (n, 2, 2)."""
     c, s = np.cos(omega * dt), np.sin(omega * dt)
-    turned: Floats = math.exp(-dt / ring.ripple_tau) * np.stack([c, -s, s, c], axis=-1).reshape(*omega.shape, 2, 2)
-    return turned
+    return math.exp(-dt / ring.ripple_tau) * np.stack([c, -s, s, c], axis=-1).reshape(*omega.shape, 2, 2)
 
 
 def transition(A: Floats, row: Floats, omega: Floats, ring: RingModel, dt: float) -> Floats:

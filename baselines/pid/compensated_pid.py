@@ -87,10 +87,7 @@ class Compensator:
         return moved @ C, moved
 
     def respond(self, v_p: npt.ArrayLike, dt: float) -> Floats:
-        """Output y_pc [m] from rest, for pull speeds v_p - v_0 [m/s] each held for dt [s].
-
-        ``v_p`` has shape (steps, ...), and so has the result: row k is y_pc at the end of step k.
-        """
+        """Output y_pc [m] after each step, from rest, for v_p - v_0 [m/s] held for dt [s]; shape (steps, ...)."""
         speeds = np.asarray(v_p, np.float64)
         state = np.zeros((*speeds.shape[1:], 2))
         output = np.empty_like(speeds)

@@ -1,7 +1,6 @@
 """The paper's controller made fit for service: measurement filter, anti-windup, bumpless start, trim of the recipe.
 
-The structure and the discretisation are those of :mod:`cz_gym.baselines.pid.compensated_pid` where they overlap. With
-``compensator=None`` it is a conventional PID. Radii [m], speeds [m/s], temperatures [K], power [W].
+With ``compensator=None`` it is a conventional PID. Radii [m], speeds [m/s], temperatures [K], power [W].
 """
 
 import math
@@ -81,7 +80,10 @@ class FilteredPID(MeasuredController):
         dt = self.control_interval
         slope, curvature = reference_derivatives(seen)
         error, compensator = compensated_error(self.compensator, seen, memory.compensator, dt)
-        filtered = self._filter(error - self.ring_lead * slope - memory.start, memory.filtered)
+        # A first-order low-pass, exact for a held input, which counts up to ``jump`` from the filter's output.
+        pace = -math.expm1(-dt / self.T_f) if self.T_f > 0.0 else 1.0
+        away = error - self.ring_lead * slope - memory.start - memory.filtered
+        filtered = memory.filtered + pace * np.clip(away, -self.jump, self.jump)
         start = memory.start * (math.exp(-dt / self.T_start) if self.T_start > 0.0 else 0.0)
         missed = (seen.v_p - memory.command) / self.pid.K_p
         tracking = memory.pid.integral + min(dt / self.T_track, 1.0) * missed
@@ -90,11 +92,6 @@ class FilteredPID(MeasuredController):
             pull = pull + self.K_ff * curvature / self.plant_gain
         power, heat = self.heater.step(seen, memory.heat, dt, self.v_0, self.heater_range)
         return pull, power, Memory(compensator, filtered, start, pid, pull, heat)
-
-    def _filter(self, error: Floats, filtered: Floats) -> Floats:
-        """First-order low-pass, exact for a held input, which counts up to ``jump`` from the filter's output."""
-        pace = -math.expm1(-self.control_interval / self.T_f) if self.T_f > 0.0 else 1.0
-        return filtered + pace * np.clip(error - filtered, -self.jump, self.jump)
 
 
 def reference_derivatives(seen: Measured) -> tuple[Floats, Floats]:

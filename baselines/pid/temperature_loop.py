@@ -1,8 +1,7 @@
 """The heater of a puller: a PI loop on the pyrometer, and automatic growth control.
 
-Automatic growth control is a slow outer loop: a mean pull speed above nominal for long means that the melt is too cold
-for the recipe, so the temperature set-point rises until the mean pull speed is nominal again. Temperatures [K], powers
-[W], speeds [m/s], all as deviations from the puller's nominal.
+Automatic growth control raises the temperature's set-point while the mean pull speed is above nominal. Temperatures
+[K], powers [W], speeds [m/s], all as deviations from the puller's nominal.
 """
 
 import math

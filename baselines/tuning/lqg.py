@@ -96,12 +96,10 @@ def lqg_goal(
     pull_step: float,
     by_return: bool,
 ) -> Goal:
-    """Maximise the return, or minimise the radius error, within an observable RMSE [mm] and a pull step RMS [mm/min].
-
-    Scores are about 10.
-    """
+    """Maximise the return, or minimise the radius error, within an observable RMSE and a pull step RMS [mm/min]."""
 
     def objective(figures: Figures) -> float:
+        # Scores are about 10.
         cost = -figures.mean_return / figures.steps if by_return else figures.rmse_mm / rmse_mm
         return 10.0 * cost + 100.0 * figures.failure_rate
 
@@ -189,10 +187,7 @@ FAMILY = tuple(each.name for each in LQGS if not each.by_return)
 
 
 def adaptive(plain: LQG) -> LQG:
-    """The same LQG with a bank of filters that estimates the strength of each crystal's interface fluctuations.
-
-    Its filters assume FACTORS times the standard deviations of the design, each pair equally likely at first.
-    """
+    """The same LQG with a bank of filters, for FACTORS times its standard deviations of the interface fluctuations."""
     noise = plain.design.noise
     fast, slow = (tuple(factor * sd for factor in FACTORS) for sd in (noise.fast_sd, noise.slow_sd))
     return replace(plain, hypotheses=Hypotheses(fast, slow))

@@ -64,10 +64,7 @@ STEP_PRICE, FAILURE_PRICE, MISS_PRICE = 0.2, 5.0, 2.0
 
 @lru_cache(maxsize=4)
 def margins(policy: FilteredPID) -> list[tuple[LoopMargins, Puller]]:
-    """Margins of the sampled loop opened at the camera, without anti-windup, on Models I and II of the puller.
-
-    They are those of a stable loop, whether it is stable or not.
-    """
+    """Margins, as of a stable loop, opened at the camera, without anti-windup, on Models I and II of the puller."""
     free, dt = linear_form(policy).free, policy.control_interval
     pullers = [make_puller(policy.parameters, lam, policy.meniscus) for lam in (1.0, 0.0)]
     return [(loop_margins(free, puller, dt, stable=True, points=400), puller) for puller in pullers]
@@ -84,10 +81,7 @@ def insensitive(figures: Figures, policy: FilteredPID) -> float:
 
 
 def below_half_the_zero(figures: Figures, policy: FilteredPID) -> float:
-    """Relative slack of the crossover below half the zero on Models I and II [-]: the paper's rule without compensator.
-
-    Where the gain never falls through one, the rule is fulfilled.
-    """
+    """Relative slack of a crossover below half the zero on Models I and II [-]: the paper's rule."""
     zeros = ((loop, radius_model(puller, policy.meniscus).zero) for loop, puller in margins(policy))
     return 1.0 - max(0.0, *(loop.crossover / (0.5 * zero) for loop, zero in zeros))
 

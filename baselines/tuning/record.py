@@ -140,12 +140,5 @@ class Tuned(ABC):
     @property
     def contender(self) -> Contender:
         """The controller as a row of the benchmark."""
-        return Contender(
-            self.name,
-            self.make,
-            "measured",
-            self.meaning,
-            default=self.default,
-            on_puller=self.on_puller,
-            quoted=self.quoted,
-        )
+        alike = "name", "make", "meaning", "default", "on_puller", "quoted"
+        return Contender(observation="measured", **{each: getattr(self, each) for each in alike})

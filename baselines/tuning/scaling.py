@@ -1,7 +1,6 @@
 """Settings of PIDs in proportion to a puller.
 
-They follow from the default puller's: times from the time scale of the inverse response (one over the zero of G_m),
-gains from the plant's, the temperature loop's from the heater's capacity.
+Times follow the zero of G_m, gains the plant's, the temperature loop's the heater's capacity.
 """
 
 from functools import reduce
@@ -10,7 +9,7 @@ from typing import Any
 from cz_gym.baselines.analysis.compensator_design import CUT_OFF, design_compensator
 from cz_gym.baselines.pid.industrial import Industrial
 from cz_gym.body.linearisation import RadiusModel, radius_model
-from cz_gym.body.plant import Puller, make_puller
+from cz_gym.body.plant import make_puller
 from cz_gym.config import Config
 from cz_gym.machine.puller import DEFAULT
 from cz_gym.support.units import MM
@@ -38,7 +37,8 @@ def factors(config: Config) -> dict[str, float]:
     capacity; the melt temperature that changes growth by v_0.
     """
     default, own = radius_model(make_puller()), model_of(config)
-    time, trims = default.zero / own.zero, [_trim(make_puller(of)) for of in (config.parameters, DEFAULT.parameters)]
+    time, pullers = default.zero / own.zero, map(make_puller, (config.parameters, DEFAULT.parameters))
+    trims = [p.v_0 * p.rho_dH * p.h_0 / p.k_l for p in pullers]
     gains = [design_compensator(model, CUT_OFF / slower).gain for model, slower in ((own, time), (default, 1.0))]
     return {
         "time": time,
@@ -54,11 +54,6 @@ def factors(config: Config) -> dict[str, float]:
 def model_of(config: Config) -> RadiusModel:
     """Model I of an environment's puller."""
     return radius_model(make_puller(config.parameters, 1.0, config.meniscus))
-
-
-def _trim(p: Puller) -> float:
-    """Temperature of the melt that changes the growth rate by v_0 [K]."""
-    return p.v_0 * p.rho_dH * p.h_0 / p.k_l
 
 
 def scaled(settings: Any, config: Config) -> Any:

@@ -1,9 +1,8 @@
 """A search of a controller's settings: candidates, history, resume, choice on validation seeds.
 
-SciPy's COBYLA proposes candidates, beginning with the settings that ship. They are scored on training seeds, and every
-one of them is kept in a file. The best ones, the finalists, are scored on validation seeds; the best of these is chosen
-and written into the same file. Test seeds are never used. COBYLA is deterministic: the same command meets the
-candidates of a search that was stopped again, measures none of them again, and continues.
+SciPy's COBYLA proposes candidates, which are scored on training seeds and stored in a file; the best of the finalists
+on validation seeds is chosen. COBYLA is deterministic: the same command meets the candidates of a search that was
+stopped again, measures none of them again, and continues.
 """
 
 import json
@@ -77,9 +76,8 @@ class Search:
         measure: Measure = measure,
         quick: bool = False,
     ) -> None:
-        """At most ``trials`` candidates, each on ``episodes`` training episodes; tests replace ``measure``.
-
-        A ``quick`` search ends at QUICK_STEP, and only its finalists have to survive other scenarios.
+        """At most ``trials`` candidates, each on ``episodes`` training episodes; a ``quick`` search ends at QUICK_STEP,
+        and only its finalists have to survive other scenarios.
         """
         self.controller, self.goal, self.config, self.measure, self.quick = controller, goal, config, measure, quick
         self.budget, self.trials = {"trials": trials, "episodes": episodes}, list[Trial]()

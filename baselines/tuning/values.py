@@ -1,8 +1,7 @@
 """Values that searches have chosen for controllers, by scenario for the default puller, or for another puller.
 
 Those of the default puller are in ``cz_gym/machine/pullers/default``, a file a controller and scenario; those of
-another puller are in the folder beside its file. Each file has the history of its search (``cz-gym tune``), which was
-scored on training seeds and decided on validation seeds.
+another puller are in the folder beside its file. Each file has the history of its search (``cz-gym tune``).
 """
 
 import json
@@ -70,8 +69,7 @@ def for_scenario(controller: str, scenario: Scenario) -> Mapping[str, float]:
 def for_puller(controller: str, puller: PullerFile) -> Mapping[str, float]:
     """The values that a search has chosen for a puller's file, by path; empty if there are none.
 
-    A puller made of the default one's file by other numbers has none. CzError if they were chosen for other numbers of
-    the puller.
+    CzError if they were chosen for other numbers of the puller.
     """
     path = folder_of(puller) / f"{controller}.json"
     if puller.file is None or path.parent == FOLDER / DEFAULT.name or not path.is_file():

@@ -129,11 +129,10 @@ def rows_of(arguments: argparse.Namespace) -> list[Row]:
 
 
 def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Contender]:
-    """Controllers and agents that the command line asks for, classical controllers first.
+    """Controllers and agents that the command line asks for, classical controllers first; CzError for unknown ones.
 
-    Controllers and agents from files of the user's always take part. Shipped agents do by default if no agent is given.
-    Slow controllers do if ``--slow`` asks for them, or if they are named and all their episodes cached. CzError names
-    what was given and what is allowed.
+    Those of the user's files always take part, shipped agents by default if no agent is given, slow controllers if
+    ``--slow`` asks for them, or if they are named and all their episodes cached.
     """
     own, given = [user_code.controller(place) for place in arguments.controller], given_agents(arguments)
     registered, shipped = [each.name for each in registry.CONTROLLERS], shipped_names()
@@ -149,9 +148,8 @@ def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Co
     elif not wanted and own and not arguments.slow:
         wanted = [each.name for each in registry.CONTROLLERS if each.quoted]
     elif not wanted:
-        wanted = [
-            each.name for each in registry.CONTROLLERS if (arguments.slow if each.slow else each.default)
-        ] + agents
+        usual = [each for each in registry.CONTROLLERS if (arguments.slow if each.slow else each.default)]
+        wanted = [each.name for each in usual] + agents
     elif wanted == ["all"]:
         wanted = [each.name for each in registry.CONTROLLERS if may_run(each)] + agents
     for name in wanted:

@@ -102,10 +102,7 @@ def _summary_line(summary: dict[str, float]) -> str:
 
 
 def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tuple[Recipe, int]:
-    """Recipe and training seed of the command line; what it leaves out is that of the first resumed run, if any.
-
-    CzError if there is a run that is not to be resumed.
-    """
+    """Recipe and training seed of the command line, or of the first resumed run; CzError if none may resume."""
     begun = [folder for folder in folders if (folder / "settings.json").exists()]
     if begun and not arguments.resume:
         raise CzError(f"{begun[0]} holds a run already: --resume it, or name another --out")

@@ -1,8 +1,7 @@
 """``cz-gym tune``: search the settings of controllers, on a scenario or for a puller of the user's own.
 
-For a puller its PIDs and the filter of its LQGs are searched from their scaled settings, side by side. Half of the
-crystals have hot zones that are not the file's, so that the chosen settings are robust to them. Choices and histories
-are stored in a folder beside the file.
+For a puller its PIDs and the filter of its LQGs are searched from their scaled settings, side by side, half of the
+crystals on hot zones that are not the file's. Choices and histories are stored in a folder beside the file.
 """
 
 import argparse

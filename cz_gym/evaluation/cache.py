@@ -1,8 +1,7 @@
 """Cached episodes of slow controllers, and the bound of an earlier benchmark: neither needs to run again.
 
 The cache has one file an episode, in a folder named by controller, scenario and a hash of all that the results depend
-on: the controller's settings, the environment's (plant, scenario, interval, horizon), the code of both, and the
-packages that compute.
+on: settings and code of controller and environment, and the packages that compute.
 """
 
 import hashlib
@@ -76,8 +75,7 @@ class SlowEpisodes:
 def earlier_bound(folder: Path, row: Row, samples: Sequence[Sample]) -> Sample | None:
     """The bound on a row from a folder of benchmark results, which has neither its signals nor its time.
 
-    None unless the folder has the row's first test episodes, and at least one classical controller ran then and now,
-    with the same figures: another plant, scenario or code makes other figures.
+    None unless that bound met the row's first episodes, and a classical controller had the same figures then and now.
     """
     try:
         earlier = read_episodes(folder / EPISODES, ("seed", *GAPS))[row.name]
@@ -110,10 +108,7 @@ def code_behind(module: str) -> str:
 
 
 def sources_behind(module: str) -> list[Path]:
-    """Sources that compute the figures of a policy.
-
-    These are plant, environment and metrics, and the policy's module, or the whole package of it if it is ours.
-    """
+    """Sources of a policy's figures: plant, environment, metrics, and its module, or its package if that is ours."""
     plant = [file for file in compiled_sources() if file.relative_to(PACKAGE).parts[0] not in PICTURES]
     metrics = [Path(__file__).with_name(name) for name in ("rollout.py", "metrics.py")]
     package = ".".join(module.split(".")[:2]) if module.startswith("cz_gym.") else module

@@ -75,10 +75,9 @@ class Contender:
 
 
 def agent(name: str, policies: Sequence[Any], own: bool = False) -> Contender:
-    """An agent from its policies with a ``contract``, one a training seed.
+    """An agent, the user's ``own`` if it was given as a file, from its policies, one a training seed.
 
-    It is the user's ``own`` if it was given as a file. Raises CzError if the policies are not training seeds of one
-    agent.
+    Raises CzError if the policies are not training seeds of one agent.
     """
     contracts = [policy.contract for policy in policies]
     seeds = tuple(contract.training_seed for contract in contracts)
@@ -92,10 +91,11 @@ def agent(name: str, policies: Sequence[Any], own: bool = False) -> Contender:
     one = contracts[0]
     meaning = f"agent trained with {one.algorithm} on {one.scenario}{', given as a file' if own else ''}"
     return Contender(
-        name, partial(_given, policies[0]), one.observation, meaning,
+        name, partial(unchanged, policies[0]), one.observation, meaning,
         action=one.action, own=own, training_seeds=seeds, trained=tuple(policies),
     )  # fmt: skip
 
 
-def _given(policy: Any, config: Config) -> Any:
+def unchanged(policy: Any, config: Config) -> Any:
+    """The policy, whatever the environment is."""
     return policy

@@ -1,12 +1,7 @@
-"""Radius error at equal pull activity: how a controller compares with a family of references as active as itself.
+"""Radius error at equal pull activity: a controller that moves the pull speed more can hold the radius better.
 
-A controller that moves the pull speed more can hold the radius better, so two radius errors are comparable only at
-equal activity, the RMS of the pull step. A *reference family* is one controller tuned for several activities; its
-members span a frontier of radius error against activity. Between the members, the logarithm of the radius error is a
-monotone cubic (Fritsch and Carlson's PCHIP) of the logarithm of the activity::
-
-    curve = frontier([(0.005, 0.14), (0.01, 0.10), (0.02, 0.07)])  # activity [mm/min], radius error [mm]
-    curve.at(0.015)                                                # radius error of the family there [mm]
+A *reference family* is one controller tuned for several activities, RMS of the pull step; its members span a frontier
+of radius error: a monotone cubic (Fritsch and Carlson's PCHIP) in logarithms of both.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,7 +41,7 @@ class Frontier(NamedTuple):
 
 
 def frontier(points: Sequence[Point]) -> Frontier:
-    """Return the frontier of these points; a point is left out if another has less activity and less error.
+    """Return the frontier of these points, without those that another one beats in both numbers.
 
     Raises CzError for numbers that are not positive, and if fewer than two points are left.
     """

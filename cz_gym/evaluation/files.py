@@ -53,10 +53,7 @@ def check_targets(folder: Path | None, lone: Path | None, partial: bool, overwri
 def write(
     folder: Path | None, lone: Path | None, results: Sequence[Result], command: str, quoted: Path | None = None
 ) -> None:
-    """Write the files, ``benchmark.json`` last, and the table between the markers of the page ``quoted``, if it exists.
-
-    Needs matplotlib and plotly if there is a folder.
-    """
+    """Write the files, ``benchmark.json`` last, and the table into the page ``quoted``, if it exists."""
     text = to_json(results, command).encode()
     files: dict[Path, bytes] = {}
     if folder:

@@ -97,8 +97,7 @@ def metrics(run: Rollout) -> Metrics:
 def radius_error(run: Rollout, offset: Floats | float = 0.0) -> Floats:
     """The radius error plus an offset [m], shape (steps, episodes); from a failing step on the largest allowed one."""
     value, reference = (getattr(run.signals, name) for name in run.config.process.Lean._fields[:2])
-    error: Floats = np.where(_lost(run), run.config.radius_limit, value - reference + offset)
-    return error
+    return np.where(_lost(run), run.config.radius_limit, value - reference + offset)
 
 
 def _lost(run: Rollout) -> npt.NDArray[np.bool_]:

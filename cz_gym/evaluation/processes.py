@@ -14,9 +14,8 @@ from cz_gym.errors import CzError
 from cz_gym.support.processors import processors
 
 WAIT = 1.0
-"""Longest time between two calls of :data:`Look` [s]."""
+"""Longest time between two calls of :data:`Look` [s], a function that is called while tasks run."""
 Look = Callable[[], None]
-"""A function that is called about once a second while tasks run."""
 
 
 def through(
@@ -38,10 +37,7 @@ def through(
 def in_processes(
     function: Callable[[Any], Any], tasks: Sequence[Any], look: Look | None = None, processes: int | None = None
 ) -> Iterator[tuple[int, Any]]:
-    """Run ``function`` on every task in a pool of processes (None: one a processor), as :func:`through` does.
-
-    When the caller stops early, or is killed, the pool's processes end; no other process does.
-    """
+    """Run tasks as :func:`through` does, in a pool of processes (None: one a processor) that ends with its caller."""
     # Forking would copy the threads of torch and of the native batch in unknown states.
     context = get_context("spawn")
     leash, held = context.Pipe(duplex=False)

@@ -87,14 +87,6 @@ _RAMP = (
     "the recipe's temperature rises by 5 K; a drive that ignores the recipe, as open-loop does, meets no disturbance"
 )
 _FALL = "the radius reference falls by {} mm within 30 min; nothing else happens"
-_ALONE = (
-    ("recipe", "errors of the recipe"),
-    ("drift", "drift of the hot zone"),
-    ("interface", "interface fluctuations"),
-    ("sensor", "sensor noise"),
-    ("reference", "changes of the reference"),
-    ("parameters", "unlike pullers"),
-)
 
 ROWS: tuple[Row, ...] = (
     Row(
@@ -113,7 +105,14 @@ ROWS: tuple[Row, ...] = (
     Row("nominal", "nominal", "nothing happens", "I", default=False),
     *(
         Row(f"only-{name}", f"only-{name}", f"{what} alone, as wide as in randomized", default=False)
-        for name, what in _ALONE
+        for name, what in (
+            ("recipe", "errors of the recipe"),
+            ("drift", "drift of the hot zone"),
+            ("interface", "interface fluctuations"),
+            ("sensor", "sensor noise"),
+            ("reference", "changes of the reference"),
+            ("parameters", "unlike pullers"),
+        )
     ),
     Row("randomized-I", "randomized", "randomized, every puller conducting only: Model I", "I", default=False),
     Row("randomized-II", "randomized", "randomized, every puller convecting only: Model II", "II", default=False),

@@ -1,7 +1,4 @@
-"""Counterfactuals: the same episodes with another controller from some moment on.
-
-Equal seeds and actions give equal episodes bit for bit, so that the controller is all that differs.
-"""
+"""Counterfactuals: the same episodes, bit for bit, with another controller from some moment on."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,10 +1,9 @@
 """The benchmark's results: samples, which were measured, and for each row the estimates that are computed from them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Self
 
 import numpy as np
 
@@ -44,7 +43,7 @@ class Sample:
     """Share of time outside the row's tolerance band [-], shape (training seeds or 1, episodes), if it has one."""
 
     @classmethod
-    def of(cls, contender: Contender, runs: Iterable[Rollout], tolerance: float | None = None) -> Sample:
+    def of(cls, contender: Contender, runs: Iterable[Rollout], tolerance: float | None = None) -> Self:
         """Metrics of rollouts on the same episodes, one a training seed, and the signals of the first one."""
         example, values, times, shares = None, [], [], []
         for run in runs:
@@ -57,7 +56,7 @@ class Sample:
         )
 
     @classmethod
-    def joined(cls, seeds: Sequence[int], parts: Sequence[Sample]) -> Sample:
+    def joined(cls, seeds: Sequence[int], parts: Sequence[Self]) -> Self:
         """Join a controller's samples, in any order, which together hold the episodes of ``seeds``."""
         rows = {seed: values for part in parts for seed, values in zip(part.seeds, part.values[0], strict=True)}
         microseconds = np.average([part.microseconds for part in parts], weights=[len(part.seeds) for part in parts])
@@ -74,7 +73,7 @@ class Sample:
         """One metric, shape (training seeds or 1, episodes)."""
         return self.values[:, :, metric_names().index(name)]
 
-    def first(self, episodes: int) -> Sample:
+    def first(self, episodes: int) -> Self:
         """The same sample on its first episodes."""
         share = None if self.outside is None else self.outside[:, :episodes]
         return replace(self, seeds=self.seeds[:episodes], values=self.values[:, :episodes], outside=share)

@@ -1,7 +1,7 @@
 """Running a benchmark: every contender on every row."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,8 +103,8 @@ def run(
         for number, task in enumerate(tasks[:alone]):
             bar.set_description(f"{task.row.name}, {task.contender.name}")
             samples[number] = measure(task, bar.update)
-        for place, facts in in_processes(_facts, tasks[alone:], processes=min(processors(), PROCESSES)):
-            samples[alone + place] = Sample(tasks[alone + place].contender, *facts)
+        for place, sample in in_processes(measure, tasks[alone:], processes=min(processors(), PROCESSES)):
+            samples[alone + place] = replace(sample, contender=tasks[alone + place].contender)
             bar.update(tasks[alone + place].steps)
     results = []
     for row in rows:
@@ -113,7 +113,7 @@ def run(
     return results
 
 
-def measure(task: Task, progress: Callable[[int], Any]) -> Sample:
+def measure(task: Task, progress: Callable[[int], Any] = lambda steps: None) -> Sample:
     """The sample of a task; a slow controller's cached episodes are read, the others run in blocks and cached."""
     each, row, seeds = task.contender, task.row, task.seeds
     if not each.slow:
@@ -126,9 +126,3 @@ def measure(task: Task, progress: Callable[[int], Any]) -> Sample:
         parts.append(run_episodes(each, row, left[first : first + BLOCK], progress))
         store.write(parts[-1])
     return Sample.joined(seeds, parts)
-
-
-def _facts(task: Task) -> tuple[Any, ...]:
-    """In another process: the sample of a task without its contender, which the caller has."""
-    sample = measure(task, lambda steps: None)
-    return sample.seeds, sample.values, sample.microseconds, sample.example, sample.outside

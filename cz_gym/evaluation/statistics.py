@@ -1,15 +1,12 @@
 """Uncertainty of the benchmark's figures: 95 % percentile bootstrap over episodes and training seeds.
 
-Values have shape (training seeds, episodes, metrics); a controller that is not trained has one "seed". All controllers
-of a scenario meet the same crystals, so one set of resampled episodes serves them all: metrics and controllers stay
-paired in every resample. Training seeds are crossed with episodes (every trained copy meets every crystal), so seeds
-and episodes are resampled on their own and their weights multiply.
+Values have shape (training seeds, episodes, metrics); a controller that is not trained has one "seed". All meet the
+same crystals, so one set of resampled episodes serves them all; training seeds are crossed with episodes, so both are
+resampled on their own and their weights multiply.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -53,7 +50,7 @@ class Resamples:
     episodes: Floats
 
     @classmethod
-    def draw(cls, episodes: int, count: int = RESAMPLES) -> Resamples:
+    def draw(cls, episodes: int, count: int = RESAMPLES) -> Self:
         """Draw multinomial counts over ``episodes``, ``count`` times. Raises CzError without episodes."""
         return cls(_weights(episodes, count, np.random.default_rng(SEED)))
 
@@ -82,10 +79,7 @@ def differences(values: Floats, reference: Floats, resamples: Resamples) -> tupl
 
 
 def probability_of_improvement(values: Floats, reference: Floats, resamples: Resamples) -> Estimate:
-    """Estimate how often one metric (lower is better) is lower than the reference's on a crystal, ties half.
-
-    ``values`` and ``reference`` have shape (training seeds, episodes).
-    """
+    """Estimate how often a metric, shape (seeds, episodes), is lower than the reference's on a crystal, ties half."""
     ours, theirs = values[:, None], reference[None]
     wins = ((ours < theirs) + 0.5 * (ours == theirs)).mean(axis=1)[:, :, None]
     return means(wins, resamples)[0]
@@ -110,9 +104,9 @@ def cvar(values: Floats, resamples: Resamples) -> Estimate:
 
 
 def optimality_gap(costs: Floats, reference: Floats, bound: Floats, resamples: Resamples) -> Estimate | None:
-    """Estimate (J - J_bound) / (J_reference - J_bound), with J the mean loss over seeds and the same episodes.
+    """Estimate (J - J_bound) / (J_reference - J_bound), J the mean of losses of shape (training seeds, episodes).
 
-    All three have shape (training seeds, episodes). 0 is the bound, 1 the reference; None where the two are equal.
+    0 is the bound, 1 the reference; None where the two are equal.
     """
     three = costs, reference, bound
     ours, theirs, least = (values.mean() for values in three)

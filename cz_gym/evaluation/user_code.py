@@ -20,9 +20,7 @@ from .protocol import Row
 
 
 def load(place: str, kind: str, fits: Callable[[Any, str], bool]) -> tuple[str, Any]:
-    """Return the name and the object at ``FILE.py:NAME``; CzError says why there is none.
-
-    What the user's file itself raises is raised here, with its traceback.
+    """Return the name and the object at ``FILE.py:NAME``; CzError says why there is none. Bugs of the file are raised.
 
     ``fits`` says of an object and the module's name whether the file may offer it as one of that ``kind``.
     """

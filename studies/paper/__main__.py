@@ -1,7 +1,4 @@
-"""``python -m studies.paper --out results/paper``: Part II of the paper, redone on our plant.
-
-The report has the comparison, the figures, and what the paper does not show; docs/paper.md explains.
-"""
+"""``python -m studies.paper --out results/paper``: Part II of the paper, redone on our plant (docs/paper.md)."""
 
 import argparse
 import json

@@ -3,74 +3,60 @@
 import math
 from typing import Any, NamedTuple
 
-from cz_gym.body.linearisation import RadiusModel
 from cz_gym.evaluation.report.tables import markdown as table
 from cz_gym.support.units import HOUR, MM
 
 from . import experiments as ex
 from .experiments import COMPENSATOR, CROSSOVER, ODE, PHASE_MARGIN_DEG, PUBLISHED, ZERO
 
-DAY = 24.0 * HOUR
-
 
 class Row(NamedTuple):
-    """One line of the comparison."""
+    """One line of the comparison; ``published`` is None where Part II gives no number."""
 
     quantity: str
     unit: str
     published: float | None
-    """Value that Part II prints; None if it gives no number."""
     ours: float
     why: str = ""
-
-    @property
-    def difference(self) -> str:
-        """Ours minus published, and in per cent of the published value."""
-        if self.published is None:
-            return "-"
-        gap = self.ours - self.published
-        return f"{gap:+.2g} ({100.0 * gap / abs(self.published):+.2f} %)"
 
 
 def rows() -> list[Row]:
     """The whole comparison, in the paper's order."""
-    linear = [row for model in ex.MODELS for row in _linear_rows(model, ex.linear_model("own", model))]
-    return linear + _compensator_rows() + _margin_rows() + _response_rows()
+    return [*_linear_rows("I"), *_linear_rows("II"), *_compensator_rows(), *_margin_rows(), *_response_rows()]
 
 
-def _linear_rows(model: str, ours: RadiusModel) -> list[Row]:
-    paper, other = PUBLISHED[model], PUBLISHED["II" if model == "I" else "I"]
-    split = (
-        f"the paper's two numerators differ by {100 * abs(1 - paper.numerator / other.numerator):.1f} %, unexplained; "
-        "both models share one geometry, so ours has one numerator, close to Model II's"
-    )
-    spread = "within the spread of silicon's surface tension and density"
-    integrator = (
-        "our growth rate does not depend on height in Model II: an exact integrator; the paper's pole has a time "
-        f"constant of {1.0 / (DAY * paper.poles[0]):.0f} days"
-    )
+def _linear_rows(model: str) -> list[Row]:
+    paper, ours = PUBLISHED[model], ex.linear_model("own", model)
+    apart = 100 * abs(1 - PUBLISHED["I"].numerator / PUBLISHED["II"].numerator)
+    why_numerator, why_height, why_lead = {
+        "I": (
+            f"the paper's two numerators differ by {apart:.1f} %, unexplained; both models share one geometry, so ours "
+            "has one numerator, close to Model II's",
+            "fitted by the nominal superheat dT_0",
+            "see the product",
+        ),
+        "II": (
+            "within the spread of silicon's surface tension and density",
+            "our growth rate does not depend on height in Model II: an exact integrator; the paper's pole has a time "
+            f"constant of {1.0 / (24.0 * HOUR * paper.poles[0]):.0f} days",
+            "fitted by the ring's slope phi_b",
+        ),
+    }[model]
     product = "G_p and G_m trade a factor between the paper's models; their product, which the ring shows, does not"
+    slow = "time constants above a day; the loop does not feel them"
     rounded = f"published value from its G_m; the text rounds to {ZERO}"
     # The paper's two poles, cone angle's first, as ours are ordered.
     cone, height = paper.poles if model == "I" else paper.poles[::-1]
-    why_n, why_height, why_lead = (
-        (split, "fitted by the nominal superheat dT_0", "see the product")
-        if model == "I"
-        else (spread, integrator, "fitted by the ring's slope phi_b")
-    )
-    why_cone = "time constants above a day; the loop does not feel them"
+    both = paper.numerator * paper.lead, ours.numerator * ours.lead
     return [
-        Row(f"G_p,{model} numerator", "1/s", paper.numerator, ours.numerator, why_n),
-        Row(f"G_p,{model} cone-angle pole", "rad/s", cone, ours.poles[0], why_cone),
+        Row(f"G_p,{model} numerator", "1/s", paper.numerator, ours.numerator, why_numerator),
+        Row(f"G_p,{model} cone-angle pole", "rad/s", cone, ours.poles[0], slow),
         Row(f"G_p,{model} height pole", "rad/s", height, ours.poles[1], why_height),
         Row(f"G_m,{model} coefficient of s", "s", paper.lead, ours.lead, why_lead),
         Row(f"G_m,{model} constant", "-", paper.constant, ours.constant, "matters only below 1e-4 rad/s"),
-        Row(
-            f"G_p,{model} numerator x G_m,{model} coefficient", "-", paper.numerator * paper.lead,
-            ours.numerator * ours.lead, product,
-        ),
+        Row(f"G_p,{model} numerator x G_m,{model} coefficient", "-", *both, product),
         Row(f"right half plane zero, Model {model}", "rad/s", paper.zero, ours.zero, rounded),
-    ]  # fmt: skip
+    ]
 
 
 def _compensator_rows() -> list[Row]:
@@ -116,10 +102,13 @@ def _response_rows() -> list[Row]:
         ]
         n = ex.ramp_numbers(ex.ramp(m))
         rows += [
-            Row(f"ramp, largest true error, Model {m}", "mm", None, n["max_error_mm"], 'the text says "small"'),
-            Row(f"ramp, true RMSE, Model {m}", "mm", None, n["rmse_mm"]),
-            Row(f"ramp, largest error of r_tilde, Model {m}", "mm", None, n["max_compensated_error_mm"]),
-            Row(f"ramp, lowest pull speed, Model {m}", "mm/min", None, n["v_p_min_mm_per_min"]),
+            Row(f"ramp, {what}, Model {m}", unit, None, n[name], why)
+            for what, unit, name, why in (
+                ("largest true error", "mm", "max_error_mm", 'the text says "small"'),
+                ("true RMSE", "mm", "rmse_mm", ""),
+                ("largest error of r_tilde", "mm", "max_compensated_error_mm", ""),
+                ("lowest pull speed", "mm/min", "v_p_min_mm_per_min", ""),
+            )
         ]
     return rows
 
@@ -128,8 +117,11 @@ def as_markdown(rows: list[Row]) -> str:
     """The comparison as a Markdown table, numbers with five significant digits."""
     lines = []
     for row in rows:
-        published = "-" if row.published is None else f"{row.published:.5g}"
-        lines.append((row.quantity, row.unit, published, f"{row.ours:.5g}", row.difference, row.why))
+        published, difference = "-", "-"
+        if row.published is not None:
+            gap = row.ours - row.published
+            published, difference = f"{row.published:.5g}", f"{gap:+.2g} ({100.0 * gap / abs(row.published):+.2f} %)"
+        lines.append((row.quantity, row.unit, published, f"{row.ours:.5g}", difference, row.why))
     return table(("quantity", "unit", "published", "ours", "difference", "why"), lines, "---")
 
 

@@ -1,8 +1,7 @@
 """Numbers that Part II prints, its design, and its experiments on our nonlinear plant; each result is computed once.
 
 Bukhari, Hovd and Winkler, "Inverse response behaviour in the bright ring radius measurement of the Czochralski process
-II: Mitigation by control", Journal of Crystal Growth. Its controller's own numbers are the defaults that it is built
-with.
+II: Mitigation by control", Journal of Crystal Growth.
 """
 
 from functools import cache
@@ -127,9 +126,9 @@ def pull_change(
 
 
 def inverse_response(run: Trace, change: float = -0.1) -> tuple[float, float]:
-    """Inverse response of the ring to a pull change at t = 0; ArithmeticError if the ring never comes back.
+    """The ring's largest excursion in the wrong direction after a pull change [m], and the time until it is back [s].
 
-    Its largest excursion in the wrong direction [m], and the time until it is back at its first radius [s].
+    ArithmeticError if it never comes back.
     """
     ring = run.signals.r_br - run.signals.r_br[0]
     # Pulling slower thickens the crystal; the ring's wrong way has the sign of the change.

@@ -58,6 +58,7 @@ def test_different_numbers_of_episodes_meet_on_those_of_both():
         made("clairvoyant", [0.0, 0.1], [1.0, 1.0], privileged=True),
         made("mpc", [0.6, 0.5]),
         made("ppo", [0.4, 0.3, 9.0], training_seeds=(0,)),
+        made("seer", [0.0] * 3, training_seeds=(0,), observation="state"),
     ]
     result = summarise(find_row("randomized"), samples)
     assert len(result.seeds) == 3
@@ -70,6 +71,7 @@ def test_different_numbers_of_episodes_meet_on_those_of_both():
     # On the two episodes of all, lqg is the better rival; on its own three it would seem worse than mpc.
     assert result.rival == "lqg"
     assert result.verdicts["ppo"][::2] == pytest.approx((-0.2 / 3, 3))
+    assert list(result.verdicts) == ["ppo"], "an agent that reads the true state is a bound, and wins nothing"
 
 
 @pytest.fixture(scope="module")

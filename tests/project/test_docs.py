@@ -162,19 +162,13 @@ def test_commands_of_the_pages_are_understood(understood):
     assert len(listed) > 20
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    """The built site: warnings are errors, as in ``make docs``."""
-    folder = tmp_path_factory.mktemp("site")
+@pytest.mark.slow
+def test_the_site_loads_nothing_from_elsewhere_and_formulas_need_no_script(tmp_path):
+    """Warnings of its build are errors, as in ``make docs``."""
     makefile = (ROOT / "Makefile").read_text()
     recipe = re.search(r"^\t\$\(BIN\)/python (-m sphinx --fail-on-warning .*) build/docs$", makefile, re.MULTILINE)
     assert recipe is not None
-    python(*recipe[1].split(), str(folder))
-    return folder
-
-
-@pytest.mark.slow
-def test_the_site_loads_nothing_from_elsewhere_and_formulas_need_no_script(site):
+    python(*recipe[1].split(), str(tmp_path))
     elsewhere = {
         ".html": r"""<(?:link|script|img|source|object)\b[^>]*?(?:href|src|srcset|data)=["'](?:https?:)?//[^>]*>"""
         r"|MathJax|\$\$",
@@ -182,7 +176,7 @@ def test_the_site_loads_nothing_from_elsewhere_and_formulas_need_no_script(site)
         ".js": r"\b(?:cdn|unpkg|jsdelivr|googleapis|cloudflare)\b",
     }
     formulas = 0
-    for file in site.rglob("*.*"):
+    for file in tmp_path.rglob("*.*"):
         if file.suffix in elsewhere:
             text = file.read_text()
             assert re.findall(elsewhere[file.suffix], text) == [], file

@@ -139,18 +139,10 @@ def source(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module")
-def built(source, tmp_path_factory):
-    """The source distribution and the wheel that is built from it."""
-    folder = tmp_path_factory.mktemp("built")
-    python("-m", "build", "--no-isolation", "--outdir", str(folder), str(source))
-    return next(folder.glob("*.tar.gz")), next(folder.glob("*.whl"))
-
-
 @pytest.mark.slow
-def test_the_wheel_holds_one_package_and_what_it_needs(built, tmp_path):
-    sdist, wheel = built
-    with zipfile.ZipFile(wheel) as archive:
+def test_the_wheel_holds_one_package_and_what_it_needs(source, tmp_path):
+    python("-m", "build", "--no-isolation", "--outdir", str(tmp_path), str(source))
+    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as archive:
         names = set(archive.namelist())
         archive.extractall(tmp_path / "installed")
     tops = {name.partition("/")[0] for name in names if ".dist-info/" not in name}
@@ -161,7 +153,7 @@ def test_the_wheel_holds_one_package_and_what_it_needs(built, tmp_path):
     assert {"cz_gym/py.typed", *shipped} <= names
     assert len(shipped) > 10
     assert any(name.endswith("licenses/LICENSE") for name in names)
-    with tarfile.open(sdist) as archive:
+    with tarfile.open(next(tmp_path.glob("*.tar.gz"))) as archive:
         kept = {name.partition("/")[2] for name in archive.getnames()}
     assert {"Makefile", "train.py", "studies/paper/__main__.py", "tests/conftest.py", "CITATION.cff"} <= kept
     home = tmp_path / "installed" / "cz_gym"

@@ -50,8 +50,8 @@ def styles_of(samples: Sequence[Sample]) -> dict[str, Style]:
 def chosen(samples: Sequence[Sample], most: int) -> list[Sample]:
     """Return at most ``most`` of the samples, in their order, for a figure that has no room for all.
 
-    They are preferred in this order: the reference, the user's own, the best agent, quoted controllers, other agents,
-    other controllers, bounds. Within a group a lower mean RMSE is preferred.
+    Preferred are the reference, the user's own, the best agent, quoted controllers, other agents, other controllers,
+    bounds; within a group those of a lower mean RMSE.
     """
     ranked = sorted(samples, key=lambda sample: float(sample.metric("rmse_mm").mean()))
     learned = [sample.name for sample in ranked if sample.contender.learned and not sample.contender.bound]

@@ -56,10 +56,7 @@ class Column(NamedTuple):
 
 
 def draw(columns: Sequence[Column], dt: float, title: str, tolerance: float = 0.0) -> Figure:
-    """Draw a crystal under some controllers: radius, ring, pull, heater, melt against time, at steps of ``dt`` [s].
-
-    The reference plus and minus the tolerance [m] is a grey band.
-    """
+    """Draw a crystal under some controllers, at steps of ``dt`` [s], with a band of the tolerance [m] in grey."""
     figure = canvas(max(1.62 * len(columns) + 1.0, 5.0), 7.6)
     axes = figure.subplots(len(_PANELS), len(columns), sharex=True, sharey="row", squeeze=False)
     longest = max((column.signals for column in columns), key=lambda signals: len(signals.r_c))

@@ -36,11 +36,7 @@ def floor_of(results: Sequence[Result]) -> float:
 
 
 def pareto(results: Sequence[Result]) -> bytes:
-    """Draw mean RMSE against mean pull step RMS with 95 % intervals, both logarithmic; lower left is better.
-
-    The controllers of :func:`.chosen` have a colour each, the others are grey dots. Errors of more than :data:`FAR`
-    times the least one are left out.
-    """
+    """Draw mean RMSE, up to :data:`FAR` times the least, against pull step RMS; the :func:`.chosen` have colours."""
     samples = results[0].samples
     names, floor, style = [sample.name for sample in chosen(samples, NAMED)], floor_of(results), styles_of(samples)
     columns = min(len(results), 2)

@@ -65,10 +65,7 @@ def scrap(sample: Sample) -> Estimate | None:
 
 
 def outcome(result: Result, interval: bool = True) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Heads and rows of what a grower gets from each controller on one scenario, the fewest losses first.
-
-    Without intervals the table is short enough for a terminal.
-    """
+    """Heads and rows of a scenario's table for a grower, the fewest losses first; short without ``interval``."""
     head = f"scrap: diameter outside {band(result)}" if interval else f"outside {band(result)}"
     columns = Column("", f"{head} [% of time]", 2, PERCENT), *BESIDE[: None if interval else SHORT]
     column, *beside = (each._replace(interval=interval) for each in columns)
@@ -133,8 +130,5 @@ def _margins(sample: Sample, result: Result) -> tuple[str, ...]:
     if any(np.isnan(loop.sensitivity) for loop in loops):
         return ("unstable", *absent[1:])
     worst = (np.nanmin, "gain_up"), (np.nanmax, "gain_down"), (np.nanmin, "phase_deg"), (np.nanmin, "delay")
-    return tuple(_figure(pick, [getattr(loop, name) for loop in loops]) for pick, name in worst)
-
-
-def _figure(pick: Any, values: list[float]) -> str:
-    return "no limit" if np.isnan(values).all() else f"{pick(values):.3g}"
+    values = ((pick, [getattr(loop, name) for loop in loops]) for pick, name in worst)
+    return tuple("no limit" if np.isnan(both).all() else f"{pick(both):.3g}" for pick, both in values)

@@ -147,8 +147,7 @@ def measured_from(result: Result) -> str:
 
 
 def _training_seeds(pooled: Sequence[Sample]) -> str:
-    """Spread over the training seeds of each agent: mean RMSE of the best, the middle and the worst one, and how
-    many crystals each lost."""
+    """Mean RMSE of each agent's best, middle and worst training seed, and the crystals that each of them lost."""
     lines = []
     for sample in pooled:
         seeds = sample.contender.training_seeds

@@ -1,6 +1,5 @@
-"""``report.html``: the benchmark as one page that opens from disk: tables, and plotly's interactive pictures.
+"""``report.html``: the benchmark as one page that opens from disk, and fetches nothing: tables, and plotly's pictures.
 
-Everything is inside the file, plotly.js included, and its content policy forbids the browser to fetch anything else.
 Names come from agent files and are untrusted: they are escaped for HTML and for plotly.
 """
 

@@ -1,7 +1,4 @@
-"""Plotly's pictures, one scenario shown at a time: error against pull activity, and signals.
-
-Signals are those of each scenario's first crystal under some controllers, in panels over one time axis.
-"""
+"""Plotly's pictures, one scenario shown at a time: error against pull activity, and signals of its first crystal."""
 
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
@@ -51,10 +48,7 @@ def add_menu(figure: go.Figure, results: Sequence[Result], layouts: Sequence[Map
 
 
 def pareto(results: Sequence[Result]) -> go.Figure:
-    """Draw mean RMSE against mean pull step RMS with 95 % intervals, both logarithmic.
-
-    A controller that never moves the pull speed stands left of all others.
-    """
+    """Draw mean RMSE against mean pull step RMS with 95 % intervals; who never moves the pull speed stands leftmost."""
     figure, styles = go.Figure(), styles_of(results[0].samples)
     for number, result in enumerate(results):
         floor = floor_of([result])

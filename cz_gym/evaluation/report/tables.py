@@ -126,10 +126,7 @@ def crystals(number: int) -> str:
 
 
 def overview(results: Sequence[Result]) -> tuple[tuple[str, ...], dict[str, list[tuple[str, ...]]]]:
-    """Return heads and rows of one table: RMSE and failures on each scenario, activity and return on the first.
-
-    Rows are grouped by what the contenders knew.
-    """
+    """Return heads, and rows by what contenders knew: RMSE and failures on each scenario, drives on the first."""
     alone = [column._replace(interval=False) for column in (PULL_STEP, HEATER_STEP, RETURN)]
     columns = (RMSE, FAILURES._replace(interval=False), *alone)
     found = [{name: row for name, *row in rows(result, columns)} for result in results]

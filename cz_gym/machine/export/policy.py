@@ -11,9 +11,10 @@ import numpy.typing as npt
 
 from cz_gym.action import MadeFor, mark
 from cz_gym.observation import decode
+from cz_gym.support.nested import select
 
 from .ports import in_plant_units, in_shares, nominal_puller
-from .shell import Block, select
+from .shell import Block
 from .trace import Floats
 
 

@@ -25,6 +25,7 @@ from cz_gym.body.linearisation import INPUTS as COLUMNS
 from cz_gym.body.linearisation import STATES, linearise
 from cz_gym.config import Config
 from cz_gym.observation import Measured
+from cz_gym.support.nested import select
 from cz_gym.support.units import KILO, MINUTE, MM_PER_MIN
 
 from .ports import INPUTS, OUTPUTS, Alarm, nominal_puller, settings_of
@@ -163,14 +164,6 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
 def _beyond(value: Any, most: float) -> Any:
     """What a value has beyond +-most."""
     return value - np.clip(value, -most, most)
-
-
-def select(condition: Any, one: Any, other: Any) -> Any:
-    """``one`` where the condition of shape (n,) holds, else ``other``: arrays, or nested tuples of them."""
-    if isinstance(other, tuple):
-        parts = [select(condition, a, b) for a, b in zip(one, other, strict=True)]
-        return type(other)(*parts) if hasattr(other, "_fields") else tuple(parts)
-    return np.where(np.reshape(condition, (-1, *(1,) * (np.ndim(other) - 1))), one, other)
 
 
 @dataclass(frozen=True)

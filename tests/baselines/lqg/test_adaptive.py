@@ -11,13 +11,13 @@ from cz_gym.baselines.analysis.sampled_loop import close
 from cz_gym.baselines.bounds.future import pullers_of
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.lqg.multiple_model import Hypotheses, multiple_model_filter
-from cz_gym.baselines.policy import map_arrays
 from cz_gym.baselines.registry import make_controller
 from cz_gym.baselines.tuning.lqg import FACTORS, adaptive
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.observation import decode
+from cz_gym.support.nested import map_arrays
 from cz_gym.support.units import HOUR, MM
 from tests.observed import PLAIN, Watched, measured
 from tests.samples import NOMINAL_LQG
@@ -53,10 +53,7 @@ def test_the_bank_weights_its_filters_by_bayes_rule():
 
 @pytest.mark.parametrize(("strength", "factor"), [(0.05, 0.2), (0.5, 1.0)])
 def test_the_adaptive_lqg_estimates_how_strong_the_fluctuations_are(strength, factor):
-    """After an hour, nine of ten crystals are most likely at the end of the hypotheses that is nearest.
-
-    With the design for known hot zones: where the hot zone may be another one, its heat hides part of the fluctuations.
-    """
+    """After an hour nine of ten crystals are at the nearest hypothesis; the design is that for known hot zones."""
     config = make_config("randomized", horizon=HOUR, **PLAIN)
     config = config.with_scenario(replace(config.scenario, name="one", interface=Interface(sd=(strength, strength))))
     watched = Watched(adaptive(NOMINAL_LQG.for_config(config)), 1)

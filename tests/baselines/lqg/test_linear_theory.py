@@ -1,7 +1,4 @@
-"""The LQG on the linear plant against theory: its cost by the covariance equation.
-
-The filter is the steady one: noise of known variance, every frame valid, no limit reached.
-"""
+"""The LQG on the linear plant, its filter in steady state, against theory: its cost by the covariance equation."""
 
 from dataclasses import replace
 

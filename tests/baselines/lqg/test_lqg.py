@@ -105,11 +105,6 @@ def test_the_first_move_is_that_of_the_whole_horizon(what):
     np.testing.assert_allclose(found, expected, rtol=rtol, atol=0.0)
 
 
-def test_the_weights_on_moves_keep_the_same_law_at_other_intervals():
-    laws = [regulator(plant_model(PULLER, NOISE, dt), Weights(), dt).feedback / dt for dt in (0.5, 1.0)]
-    np.testing.assert_allclose(laws[0][0, :2], laws[1][0, :2], rtol=0.05)
-
-
 # The preview
 
 

@@ -41,18 +41,6 @@ def test_the_industrial_law_is_the_one_described(rng):
     np.testing.assert_allclose(found, literal(diameters), atol=2e-5)
 
 
-@pytest.mark.parametrize("dt", [2.0, 10.0])
-def test_other_intervals_follow_the_same_law(dt):
-    def course(interval):
-        t = np.arange(0.0, 900.0, interval)
-        return 0.5 * (1.0 - np.cos(2.0 * np.pi * t / 900.0))
-
-    usual = follow(Industrial(T_f=20.0), course(5.0))
-    other = follow(Industrial(control_interval=dt, T_f=20.0), course(dt))
-    assert other[-1] == pytest.approx(usual[-1], rel=0.08)
-    assert np.abs(other).max() == pytest.approx(np.abs(usual).max(), rel=0.05)
-
-
 def test_no_wind_up_on_a_stuck_drive():
     found = pulls(Industrial(), [measured(ring_error=0.4 * MM, v_p=0.2 * PULL_SCALE)] * 500)
     increment = found[-1] - 0.2 * PULL_SCALE

@@ -9,10 +9,8 @@ from scipy.signal import lfilter
 
 from cz_gym import make_puller
 from cz_gym.action import HEATER_RANGE
-from cz_gym.baselines.analysis.compensator_design import controller_transfer
-from cz_gym.baselines.analysis.frequency import loop_margins, response
+from cz_gym.baselines.analysis.frequency import loop_margins
 from cz_gym.baselines.analysis.linear_form import linear_form
-from cz_gym.baselines.analysis.sampled_loop import linear_controller
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID, SeriesPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
@@ -21,7 +19,6 @@ from cz_gym.baselines.tuning.values import TUNED
 from cz_gym.body.linearisation import radius_model
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured
-from cz_gym.physics.linearisation import StateSpace
 from cz_gym.physics.parameters import Parameters
 from cz_gym.support.units import MM, MM_PER_MIN
 from tests.observed import measured, pulls
@@ -50,18 +47,6 @@ def test_filter_is_exact_and_linear(dt, rng):
     expected = 0.001 * lfilter([pace], [1.0, pace - 1.0], errors)
     found = pulls(policy, [measured(ring_error=error) for error in errors])
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-12)
-
-
-@pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])
-def test_control_intervals_share_one_continuous_design(dt):
-    pid = SeriesPID(K_p=0.004, T_i=1000.0, T_d=300.0, N=5.0)
-    policy = FilteredPID(control_interval=dt, pid=pid, compensator=None, T_f=30.0, T_track=np.inf)
-    A, B, C, D = linear_controller(policy)
-    omega = np.geomspace(1e-4, 0.01, 20)
-    s = 1j * omega
-    found = response(StateSpace(A, B[:, :1], C[:1], D[:1, :1]), dt, omega) * np.exp(-s * dt / 2.0)
-    # A held filter is ahead by half a sample, which the factor above takes back.
-    np.testing.assert_allclose(found, controller_transfer(pid)(s) / (1.0 + 30.0 * s), rtol=3e-3)
 
 
 @pytest.mark.parametrize("applied", [0.0, -0.2 * MM_PER_MIN])

@@ -1,6 +1,7 @@
 """Figures: who is shown when there are many, colours, and a crystal that nothing disturbs."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,25 +29,19 @@ def sample(name, rmse, **facts):
     return Sample(contender(name, **facts), (7,), values, 0.0)
 
 
-def agent(name, rmse):
-    return sample(name, rmse, training_seeds=(0,))
-
-
 def names(samples):
     return [one.name for one in samples]
 
 
 def everyone():
     """The default table: classical controllers of the registry, and the shipped agents."""
-    default = [each for each in CONTROLLERS if each.default]
-    return [Sample(each, (7,), np.full((1, 1, len(metric_names())), 0.1), 0.0) for each in default] + [
-        agent(*each) for each in AGENTS.items()
-    ]
+    classical = [replace(sample(each.name, 0.1), contender=each) for each in CONTROLLERS if each.default]
+    return classical + [sample(*each, training_seeds=(0,)) for each in AGENTS.items()]
 
 
 def test_many_controllers_are_chosen_by_a_rule():
     many = [sample("bound", 0.1, observation="state"), sample("paper", 9.0)]
-    many += [*(sample(f"c{i}", 1.0 + i) for i in range(6)), agent("ppo", 99.0)]
+    many += [*(sample(f"c{i}", 1.0 + i) for i in range(6)), sample("ppo", 99.0, training_seeds=(0,))]
     shown = chosen(many, 4)
     assert names(shown) == ["paper", "c0", "c1", "ppo"]
     assert chosen(many[::-1], 4) == shown[::-1]
