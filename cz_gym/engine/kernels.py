@@ -185,7 +185,7 @@ def build_kernels(process: Process, meniscus: MeniscusModel) -> Kernels:
             for number in range(len(episode)):
                 numbers[model.constants + number] = episode[number]
             _begin(slot, model)
-            memory.powers[i] = slot.Q_H
+            memory.frames[i, :, 3] = slot.Q_H
             _sample_alone(memory, i, True, clock, scales, out, model)
         return impossible
 

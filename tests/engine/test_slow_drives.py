@@ -35,7 +35,7 @@ class Slot:
 @pytest.mark.parametrize("dead_time", [0.0, 7.3, 20.0])
 def test_the_plant_gets_the_energy_of_the_analytic_step_response(lag, dead_time):
     """After a step of 1 kW at t = 10 s, in substeps that no control interval or dead time fits."""
-    interval, powers, ends = 10.0, np.full(8, 2.0 * KW), np.cumsum([0.0, *([5.0, 2.0, 3.0] * 6)])
+    interval, frames, ends = 10.0, np.full((8, 4), 2.0 * KW), np.cumsum([0.0, *([5.0, 2.0, 3.0] * 6)])
     slot, begin = Slot(lag, dead_time, 2.0 * KW), 10.0 + dead_time
 
     def energy(t):
@@ -44,8 +44,8 @@ def test_the_plant_gets_the_energy_of_the_analytic_step_response(lag, dead_time)
         return 2.0 * KW * t + 1.0 * KW * (after - lagging)
 
     for start, stop in pairwise(ends):
-        powers[int(start / interval + 1e-9) % 8] = 3.0 * KW if start >= 10.0 else 2.0 * KW
-        mean = mean_power(slot, powers, start, stop, interval)
+        slot.k, slot.Q_H = int(start / interval + 1e-9), 3.0 * KW if start >= 10.0 else 2.0 * KW
+        mean = mean_power(slot, frames, start, stop, interval)
         assert mean * (stop - start) == pytest.approx(energy(stop) - energy(start), rel=1e-12)
 
 
