@@ -3,8 +3,6 @@
 The scalar environment is a batch of one; both environments are thin shells over this class.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections import deque

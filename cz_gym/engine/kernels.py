@@ -20,7 +20,7 @@ from .arithmetic import along
 from .drives import drive
 from .layout import model_of
 from .lockstep import LANES, advance
-from .outputs import recall, remember, write_channels, write_info
+from .outputs import recall, remember, write_channels
 from .sensors import sense
 
 TRIES = 100
@@ -66,7 +66,9 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, 
     if slot.k == 0:
         cost = along(cost, -1.0, cost)
     if scales.everything:
-        write_info(process.logged(slot, measured, cost, t, seen.ring, model.meniscus), out.info[:, i])
+        logged = process.logged(slot, measured, cost, t, seen.ring, model.meniscus)
+        for entry in range(len(logged)):
+            out.info[entry, i] = logged[entry]
     else:
         lean = process.lean(slot, measured)
         for entry in range(len(lean)):

@@ -39,7 +39,7 @@ def moved(batch, slots, frames, actions, column, by):
     else:
         memory.slots["Q_H"] += by
         memory.slots["Q_H_slewed"] += by
-    batch._state, batch._grows = batch._now(), np.ones(batch.num_envs, np.bool_)
+    batch._state, batch.grows = batch._now(), np.ones(batch.num_envs, np.bool_)
     step = batch.step(actions)
     return np.concatenate([step.state, step.cost], axis=1), step
 
