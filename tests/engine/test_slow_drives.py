@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
-from cz_gym.config import make_config
-from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.engine.drives import mean_power
 
 NOMINAL, KW = SCENARIOS["nominal"], 1000.0
@@ -77,8 +75,7 @@ def test_the_pyrometer_reads_the_filtered_temperature():
 
 
 def test_the_batch_and_saved_states_know_the_slow_drives():
-    scenario = replace(slow(20.0, 12.0, 15.0), name="slow")
-    settings = {"scenario": scenario, "observation": "measured", "info": "all"}
+    settings = {"scenario": slow(20.0, 12.0, 15.0), "observation": "measured", "info": "all"}
     batch, envs = CzVectorEnv(3, **settings), [CzEnv(**settings) for _ in range(3)]
     first = batch.reset(seed=1)[0], np.stack([env.reset(seed=1 + i)[0] for i, env in enumerate(envs)])
     np.testing.assert_array_equal(*first)
@@ -87,9 +84,3 @@ def test_the_batch_and_saved_states_know_the_slow_drives():
             envs[0].set_state(batch.get_state()[0])
         seen = np.stack([env.step(own)[0] for env, own in zip(envs, action, strict=True)])
         np.testing.assert_array_equal(batch.step(action)[0], seen)
-
-
-def test_derivatives_of_slow_drives_are_refused():
-    for scenario in (slow(lag=5.0), slow(dead_time=5.0), slow(tau=5.0)):
-        with pytest.raises(ValueError, match="slow heater or a pyrometer's filter has no derivatives"):
-            DifferentiableBatch(make_config(scenario), 1)
