@@ -1,7 +1,5 @@
 """The settings of an environment: one frozen, checked value, shared by its scalar and its batched form."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -9,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from numbers import Integral, Real
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from cz_gym.body.process import BODY
 from cz_gym.camera.view import Camera, camera_for, check_camera
@@ -52,7 +50,7 @@ class Identity(NamedTuple):
     puller: str = DEFAULT.label
     """Name and hash of the puller file."""
 
-    def difference(self, other: Identity) -> str | None:
+    def difference(self, other: Self) -> str | None:
         """The first difference in words; None if there is none."""
         for name, mine, its in zip(self._fields, self, other, strict=True):
             if mine != its:
@@ -116,7 +114,9 @@ class Config:
     @property
     def plant_hash(self) -> str:
         """SHA-256 of the plant: code of its equations and its meniscus, and its parameters (16 hex digits)."""
-        return _plant_hash(self.process, self.parameters, self.meniscus)
+        numbers = {name: float(value) + 0.0 for name, value in self.parameters._asdict().items()}
+        text = json.dumps([VERSION, _equations_hash(self.process, self.meniscus), numbers], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
     def made_for(self) -> MadeFor:
@@ -140,7 +140,7 @@ class Config:
             self.puller.label,
         )
 
-    def with_scenario(self, scenario: AnyScenario) -> Config:
+    def with_scenario(self, scenario: AnyScenario) -> Self:
         """The same settings on another scenario or mixture."""
         return replace(self, scenario=adapt_scenario(self.puller, find_distribution(scenario)))
 
@@ -193,13 +193,6 @@ def make_config(
         puller=machine,
         process=process,
     )
-
-
-@lru_cache(maxsize=64)
-def _plant_hash(process: Process, parameters: Parameters, meniscus: MeniscusModel) -> str:
-    numbers = {name: float(value) + 0.0 for name, value in parameters._asdict().items()}
-    text = json.dumps([VERSION, _equations_hash(process, meniscus), numbers], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 @lru_cache(maxsize=64)

@@ -3,8 +3,6 @@
 The plant is the environment's own; nothing is approximated (:mod:`cz_gym.engine.tangents`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from operator import index
@@ -89,7 +87,8 @@ class DifferentiableBatch:
         self._state = np.zeros((num_envs, len(self._names)))
         self._costs = [info.index(f"cost_{name}") for name in config.process.Cost._fields]
         self._errors = [info.index(name) for name in (*config.process.Lean._fields[:2], "ring_offset")]
-        self._grows, self._begun = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
+        self.grows, self._begun = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
+        """Whether each crystal grew in the last step, and whether each slot has one, shape (n,)."""
         self._work = np.zeros(work_shape(config.process))
         self._jacobians = BufferPool((self.num_envs, len(rows(config.process)), len(self._names) + ACTIONS), np.float64)
         self.measured_by_state = _measured_by_state(config)
@@ -112,8 +111,8 @@ class DifferentiableBatch:
             raise CzError(f"seeds must be whole numbers, not {seeds!r:.80}") from None
         self._out = self._copied()
         self._batch.reset(slots, keys, self._out)
-        self._grows = self._grows.copy()
-        self._grows[slots] = self._begun[slots] = True
+        self.grows = self.grows.copy()
+        self.grows[slots] = self._begun[slots] = True
         self._state = self._now()
         return self._state, self._out.observation
 
@@ -134,17 +133,17 @@ class DifferentiableBatch:
         batch, out = self._batch, self._copied()
         slots = batch.memory.slots
         held = np.stack([slots["Q_d"], slots["dT_i"]], axis=1)
-        active = self._grows & (batch.memory.slots["k"] < batch.clock.steps)
+        active = self.grows & (batch.memory.slots["k"] < batch.clock.steps)
         batch.step(given, out, active)
-        self._grows = active & ~out.terminated
+        self.grows = active & ~out.terminated
         self._out, self._state = out, self._now()
         jacobian = self._jacobians.new()
-        step = (held, batch.actions, self._grows, batch.clock, batch.drives)
+        step = (held, batch.actions, self.grows, batch.clock, batch.drives)
         self._tangents(batch.memory, before, *step, self._work, jacobian, 0, n)
         info = out.info[:, :n]
-        cost = np.where(self._grows, info[self._costs], 0.0).T
+        cost = np.where(self.grows, info[self._costs], 0.0).T
         value, reference, offset = info[self._errors]
-        return Step(self._state, out.observation, cost, value - reference, offset, self._grows, jacobian)
+        return Step(self._state, out.observation, cost, value - reference, offset, self.grows, jacobian)
 
     def _copied(self) -> Out:
         """A copy of the last step's results in new arrays."""
@@ -157,11 +156,6 @@ class DifferentiableBatch:
         state = np.empty((self.num_envs, len(self._names)))
         self._gather(self._batch.memory, state, 0, self.num_envs)
         return state
-
-    @property
-    def grows(self) -> npt.NDArray[np.bool_]:
-        """Whether each crystal grew in the last step, shape (n,)."""
-        return self._grows
 
     @property
     def scenarios(self) -> npt.NDArray[Any]:

@@ -1,7 +1,5 @@
 """The environment: ``gym.make("Cz-v0")``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
@@ -317,11 +315,11 @@ class CzEnv(Form, gym.Env[Observation, Action]):
 class Info(dict[str, Any]):
     """A step's ``info`` with a fast deep copy: stable-baselines3 makes one at every step."""
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Info:
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         for value in self.values():
             if type(value) not in (float, bool, str):
-                return Info(deepcopy(dict(self), memo))
-        return Info(self)
+                return type(self)(deepcopy(dict(self), memo))
+        return type(self)(self)
 
 
 def check_state(state: Any, batch: Batch) -> None:

@@ -213,7 +213,7 @@ class Process(NamedTuple):
     @property
     def past_change(self) -> tuple[float, ...]:
         """Ratio of each remembered signal's scale to the scale of its past differences [-]."""
-        return tuple(self.measured[at].scale / each.scale for at, each in zip(self.remembered, self.past, strict=True))
+        return tuple(signals(self.Measured)[each.name].scale / each.scale for each in self.past)
 
     @property
     def relative_at(self) -> tuple[int, ...]:
@@ -228,9 +228,7 @@ class Process(NamedTuple):
     @property
     def relative_change(self) -> tuple[float, ...]:
         """Ratio of each relative signal's scale to the scale of the difference [-]."""
-        return tuple(
-            self.measured[at].scale / each.scale for at, each in zip(self.relative_at, self.relative, strict=True)
-        )
+        return tuple(signals(self.Measured)[each.name].scale / each.scale for each in self.relative)
 
     @property
     def integrated_scale(self) -> float:

@@ -1,7 +1,5 @@
 """The native batch of environments: ``gym.make_vec("Cz-v0", vectorization_mode="vector_entry_point")``."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -4,8 +4,6 @@ Reward, gradients, regulators, bounds and reports all read this module. The weig
 controller's cost is its radius error; ``python -m studies.frontier`` shows how well the return ranks controllers.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 from cz_gym.jit.compile import jittable

@@ -6,8 +6,6 @@ may be floats, arrays or complex numbers. The thermal chain drives growth one wa
 Q_i stays at its nominal value, whatever the crystal does.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -3,8 +3,6 @@
 The scalar environment is a batch of one; both environments are thin shells over this class.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections import deque
@@ -39,7 +37,7 @@ SLOTS_PER_THREAD, SLOTS_AT_ONCE = 256, 128
 """Least slots per thread in a step, and slots that a thread takes at once."""
 DRAWS_PER_THREAD, DRAWS_AT_ONCE = 16, 16
 """Least draws per thread in a reset, and draws that a thread takes at once."""
-_SAVED = ("slot", "history", "frames", "powers")
+_SAVED = ("slot", "history", "frames")
 Key = tuple[int, int]
 """The 128 random bits from which an episode is drawn, as two 64-bit words."""
 
@@ -63,7 +61,6 @@ class SlotState:
     slot: npt.NDArray[Any]
     history: npt.NDArray[np.float64]
     frames: npt.NDArray[np.float64]
-    powers: npt.NDArray[np.float64]
     scenario: str
     """Name of the scenario that the episode was drawn from."""
 
@@ -93,14 +90,14 @@ class Batch:
         self.scales = ObservationScales(measured, state, newest, oldest + 1, share, everything)
         depth = int(oldest[-1]) + 2 if config.observation == "history" else 0
         interval = config.control_interval
-        frames = math.ceil(MAX_LATENCY / interval) + math.ceil((MAX_LATENCY + interval) / GRID) + 2
+        oldest_age = max(MAX_LATENCY, MAX_DEAD_TIME)
+        frames = math.ceil(oldest_age / interval) + math.ceil((oldest_age + interval) / GRID) + 2
         slots = np.zeros(num_envs, slot_type(process))
         self.memory = Memory(
             slots,
             slots.view(np.float64).reshape(num_envs, -1),
             np.zeros((num_envs, depth, process.lagged)),
-            np.zeros((num_envs, frames, 3)),
-            np.zeros((num_envs, math.ceil(MAX_DEAD_TIME / interval) + 2)),
+            np.zeros((num_envs, frames, 4)),
         )
         self.memory.slots["over"] = 1
         self._lots = scenario_table(config.scenario, config.model)
@@ -234,8 +231,8 @@ class Batch:
     def save(self, i: int) -> SlotState:
         """A copy of the state of slot i."""
         # array[i] of a structured array is a view that np.copy does not copy; array[i, ...] is an array.
-        slot, history, frames, powers = (rows[i, ...].copy() for rows in self._saved())
-        return SlotState(self.identity, slot, history, frames, powers, self.scenarios[i])
+        slot, history, frames = (rows[i, ...].copy() for rows in self._saved())
+        return SlotState(self.identity, slot, history, frames, self.scenarios[i])
 
     def check(self, state: SlotState) -> None:
         """Raise ValueError if this is no saved state, or one saved under other settings."""
@@ -264,7 +261,7 @@ class Batch:
 
     def _saved(self) -> tuple[npt.NDArray[Any], ...]:
         memory = self.memory
-        return memory.slots, memory.history, memory.frames, memory.powers
+        return memory.slots, memory.history, memory.frames
 
     def close(self) -> None:
         """Stop the threads."""

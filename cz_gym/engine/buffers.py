@@ -3,8 +3,6 @@
 Large new arrays come as untouched pages, and writing those for the first time costs a good part of a step.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 import weakref

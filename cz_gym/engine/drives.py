@@ -9,7 +9,7 @@ from cz_gym.process import Inputs
 
 from .arithmetic import clip
 
-_EPS = 1e-9
+_EPS, _POWER = 1e-9, 3
 
 
 @jittable
@@ -58,22 +58,23 @@ def drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any, process: 
 @force_inlined
 def is_slow(e: Any) -> Any:
     """Whether the power that heats is not simply the one that was set."""
-    return e.heater_lag > 0.0 or e.heater_dead_time > 0.0
+    return e.heater_lag + e.heater_dead_time > 0.0
 
 
 @jittable
-def mean_power(slot: Any, powers: Any, start: Any, stop: Any, interval: Any) -> Any:
+def mean_power(slot: Any, frames: Any, start: Any, stop: Any, interval: Any) -> Any:
     """Mean power [W] that heats from ``start`` to ``stop`` [s]: the one set, after the dead time and through the lag.
 
-    ``powers`` [W] are those set at the last control intervals, circular; the power set is constant between, so that
-    both are exact, and the mean gives the plant the energy. The lag's output stays in the slot.
+    The power set is constant in each control interval, so that both are exact, and the mean gives the plant the energy.
+    ``frames`` holds those of the last intervals, this one's is added; the lag's output stays in the slot.
     """
-    lag, dead_time = slot.episode.heater_lag, slot.episode.heater_dead_time
+    depth, lag, dead_time = frames.shape[0], slot.episode.heater_lag, slot.episode.heater_dead_time
+    frames[slot.k % depth, _POWER] = slot.Q_H
     t, energy = start, 0.0
     while t < stop - _EPS:
         step = int(np.floor((t - dead_time) / interval + _EPS))
         end = min((step + 1) * interval + dead_time, stop)
-        power, done = powers[step % powers.size], -np.expm1(-(end - t) / lag) if lag > 0.0 else 1.0
+        power, done = frames[step % depth, _POWER], -np.expm1(-(end - t) / lag) if lag > 0.0 else 1.0
         behind = slot.Q_heats - power
         energy += power * (end - t) + behind * lag * done
         slot.Q_heats = power + behind * (1.0 - done)

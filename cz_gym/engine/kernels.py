@@ -20,7 +20,7 @@ from .arithmetic import along
 from .drives import drive
 from .layout import model_of
 from .lockstep import LANES, advance
-from .outputs import recall, remember, write_channels, write_info
+from .outputs import recall, remember, write_channels
 from .sensors import sense
 
 TRIES = 100
@@ -66,7 +66,9 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, 
     if slot.k == 0:
         cost = along(cost, -1.0, cost)
     if scales.everything:
-        write_info(process.logged(slot, measured, cost, t, seen.ring, model.meniscus), out.info[:, i])
+        logged = process.logged(slot, measured, cost, t, seen.ring, model.meniscus)
+        for entry in range(len(logged)):
+            out.info[entry, i] = logged[entry]
     else:
         lean = process.lean(slot, measured)
         for entry in range(len(lean)):
@@ -185,7 +187,7 @@ def build_kernels(process: Process, meniscus: MeniscusModel) -> Kernels:
             for number in range(len(episode)):
                 numbers[model.constants + number] = episode[number]
             _begin(slot, model)
-            memory.powers[i] = slot.Q_H
+            memory.frames[i, :, 3] = slot.Q_H
             _sample_alone(memory, i, True, clock, scales, out, model)
         return impossible
 

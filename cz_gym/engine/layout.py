@@ -143,9 +143,8 @@ class Memory(NamedTuple):
     history: Any
     """Running sums of the remembered channels, circular in time, shape (n, depth, channels); depth 0: none."""
     frames: Any
-    """Time [s], ring [m] and meniscus height [m] of camera frames, circular, shape (n, depth, 3)."""
-    powers: Any
-    """Heater power set in each control interval [W], circular, shape (n, depth)."""
+    """Time [s], ring [m] and meniscus height [m] of camera frames, and the power [W] set in each control interval: both
+    circular in time, shape (n, depth, 4)."""
 
 
 class Out(NamedTuple):

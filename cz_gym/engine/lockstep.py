@@ -37,27 +37,33 @@ def _disturb(slot: Any, j: Any, process: Any) -> Any:
 
 
 @jittable
-def _begin(slot: Any, numbers: Any, powers: Any, lanes: Any, lane: Any, interval: Any, model: Any) -> None:
+def _begin(slot: Any, numbers: Any, lanes: Any, lane: Any, interval: Any, model: Any) -> None:
     """Copy a slot into its lane at the start of a control interval."""
     for constant in range(model.constants):
         lanes[constant, lane] = numbers[constant]
     set_column(model.process.State, slot.x, lanes, model.constants, lane)
     set_column(Inputs, slot, lanes, model.u_at, lane)
     lanes[model.dt_at + 1, lane] = slot.k * interval
-    if is_slow(slot.episode):
-        powers[slot.k % powers.size] = slot.Q_H
 
 
 @jittable
-def _prepare(slot: Any, powers: Any, lanes: Any, lane: Any, interval: Any, model: Any) -> None:
+def _prepare(slot: Any, lanes: Any, lane: Any, interval: Any, model: Any) -> None:
     """Prepare the next substep, to the next point of the 5 s grid or to the end of the interval."""
     t, end = lanes[model.dt_at + 1, lane], (slot.k + 1) * interval
     j = int(t / GRID + _EPS)
     upto = min((j + 1) * GRID, end)
     set_column(model.process.Disturbance, _disturb(slot, j, model.process), lanes, model.d_at, lane)
     lanes[model.dt_at, lane], lanes[model.dt_at + 1, lane] = upto - t, upto
-    if is_slow(slot.episode):
-        lanes[model.power_at, lane] = mean_power(slot, powers, t, upto, interval)
+
+
+@jittable
+def _heat(memory: Any, first: Any, count: Any, lanes: Any, interval: Any, model: Any) -> None:
+    """Give the lanes of slow heaters the power that heats in their substep."""
+    for lane in range(count):
+        slot, stop = memory.slots[first + lane], lanes[model.dt_at + 1, lane]
+        if lanes[model.dt_at + 2, lane] > 0.0 and is_slow(slot.episode):
+            start = stop - lanes[model.dt_at, lane]
+            lanes[model.power_at, lane] = mean_power(slot, memory.frames[first + lane], start, stop, interval)
 
 
 @inlined
@@ -97,16 +103,19 @@ def advance(memory: Any, active: Any, first: Any, count: Any, clock: Any, model:
     A slot is over if its crystal does not grow on.
     """
     goes = model.dt_at + 2
-    going, lanes, ends = 0, scratch(model.lane_rows, LANES), scratch(model.states, LANES)
+    going, slow, lanes, ends = 0, False, scratch(model.lane_rows, LANES), scratch(model.states, LANES)
     for lane in range(count):
         i = first + lane
-        _begin(memory.slots[i], memory.numbers[i], memory.powers[i], lanes, lane, clock.interval, model)
-        lanes[goes, lane] = 1.0 if active[first + lane] else 0.0
-        going += 1 if active[first + lane] else 0
+        _begin(memory.slots[i], memory.numbers[i], lanes, lane, clock.interval, model)
+        lanes[goes, lane] = 1.0 if active[i] else 0.0
+        going += 1 if active[i] else 0
+        slow = slow or is_slow(memory.slots[i].episode)
     while going > 0:
         for lane in range(count):
             if lanes[goes, lane] > 0.0:
-                _prepare(memory.slots[first + lane], memory.powers[first + lane], lanes, lane, clock.interval, model)
+                _prepare(memory.slots[first + lane], lanes, lane, clock.interval, model)
+        if slow:
+            _heat(memory, first, count, lanes, clock.interval, model)
         _integrate(lanes, ends, count, model)
         for lane in range(count):
             if lanes[goes, lane] > 0.0:

@@ -53,10 +53,3 @@ def recall(slot: Any, measured: Any, history: Any, scales: Any, out: Any, proces
         place, to = process.relative_at[row], process.relative_to[row]
         difference = measured[place] - measured[to]
         out[place] = clip(difference * (scales.measured[place] * process.relative_change[row]), CLIP)
-
-
-@jittable
-def write_info(values: Any, info: Any) -> None:
-    """Write the rows of ``info``."""
-    for row in range(len(values)):
-        info[row] = values[row]

@@ -5,8 +5,6 @@ kind is drawn in order of time from a stream of its own, so it depends on the ep
 step or as a whole series.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

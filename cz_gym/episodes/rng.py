@@ -5,8 +5,6 @@ first two. So a slot's random streams are plain memory: they are copied with the
 exactly, and an episode's noise need not be stored ahead. The oracle is ``numpy.random.Generator``.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -83,7 +83,7 @@ def kernel(function: F, keep: bool = True, allocates: bool = True) -> F:
 
 def _as_records(argument: Any) -> Any:
     """An array of records, alone or in named tuples, as one whose fields are attributes, as in compiled code."""
-    if hasattr(argument, "_fields"):
+    if isinstance(argument, tuple) and hasattr(argument, "_fields"):
         return type(argument)(*map(_as_records, argument))
     records = isinstance(argument, np.ndarray) and argument.dtype.names
     return argument.view(np.recarray) if records else argument

@@ -5,8 +5,6 @@ the meniscus and the vertical at the triple point, ``ring_offset`` the distance 
 bright ring. The default is Hurle's closed form; both functions compile into the step.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -15,8 +15,6 @@ turned into powers: ``SLOPE`` corrects :func:`lift`, ``RING`` and ``TAIL`` corre
 solves the equation again and compares (``tests/physics/test_young_laplace.py``).
 """
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -14,6 +14,7 @@ from cz_gym.config import make_config
 from cz_gym.differentiable import STATES, DifferentiableBatch
 from cz_gym.engine.layout import model_of
 from cz_gym.engine.tangents import rk4_by, rows, work_shape
+from cz_gym.episodes.scenario import Actuators, Sensor
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.observation import MEASURED
 from cz_gym.physics.linearisation import jacobian
@@ -39,7 +40,7 @@ def moved(batch, slots, frames, actions, column, by):
     else:
         memory.slots["Q_H"] += by
         memory.slots["Q_H_slewed"] += by
-    batch._state, batch._grows = batch._now(), np.ones(batch.num_envs, np.bool_)
+    batch._state, batch.grows = batch._now(), np.ones(batch.num_envs, np.bool_)
     step = batch.step(actions)
     return np.concatenate([step.state, step.cost], axis=1), step
 
@@ -152,11 +153,18 @@ def test_the_chain_rule_over_rk4_is_exact():
         x = rk4(x, u, d, puller, 5.0, hurle_slope)
 
 
+SLOW = (
+    {"actuators": Actuators(heater_lag=(5.0, 5.0))}, {"actuators": Actuators(heater_dead_time=(0.0, 5.0))},
+    {"sensor": Sensor(pyrometer_filter=(0.0, 5.0))},
+)  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("config", "slots", "message"),
     [
         (make_config(control_interval=10.0, **PLAIN), 2, "must be at most 5 s"),
         (make_config("all", control_interval=2.5, **PLAIN), 2, "latency of 5 s is longer"),
+        *((make_config(replace(RANDOMIZED, **slow)), 2, "slow heater or a pyrometer's filter has no") for slow in SLOW),
         ("randomized", 2, "this needs a Config, not .randomized."),
         (make_config(**PLAIN), 0, "num_envs must be"),
         (make_config(**PLAIN), 2.0, "num_envs must be"),

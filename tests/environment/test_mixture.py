@@ -42,28 +42,6 @@ def test_shares_order_and_unit_of_equal_mixtures_do_not_matter():
         config.sole_scenario  # noqa: B018
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"randomised": 1.0}, "unknown scenario 'randomised': did you mean 'randomized'"),
-        ("al", "unknown scenario 'al'.* all"),
-        ({"hard": 0.0}, "positive numbers: that of 'hard' is 0.0"),
-        ({"hard": math.nan}, "positive numbers"),
-        ({"hard": True}, "positive numbers"),
-        ({"hard": "much"}, "positive numbers"),
-        ({}, "at least one scenario"),
-        ({"hard": 1, SCENARIOS["hard"]: 1}, "'hard' is there twice"),
-        ({"all": 1.0}, "one scenario, not the mixture"),
-        ({"hard-I": 1.0}, "is a row of the benchmark"),
-        (["hard"], "unknown scenario .* dict of scenarios and their shares"),
-    ],
-)
-def test_bad_mixtures_are_refused_in_one_line(given, message):
-    with pytest.raises(ValueError, match=message) as refusal:
-        CzEnv(given)
-    assert "\n" not in str(refusal.value)
-
-
 def test_shares_of_two_thousand_episodes_on_a_stream_of_their_own():
     _, infos = CzVectorEnv(2000, "all").reset(seed=5)
     names, upto = [each.name for each in ALL.scenarios], np.cumsum(ALL.shares)

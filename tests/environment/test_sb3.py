@@ -1,18 +1,15 @@
-"""Cz-v0 and its adapter under stable-baselines3's checker and wrappers, against a vector of scalar environments."""
-
-import warnings
+"""The adapter under stable-baselines3's wrappers, against a vector of scalar environments."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
+from cz_gym import CzEnv, CzVectorEnv
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.asymmetric import AsymmetricPolicy, AsymmetricSACPolicy, LearnState
 from cz_gym.agents.from_sb3 import save_agent
@@ -131,14 +128,6 @@ def test_methods_and_attributes_reach_the_slots_that_are_named_as_in_sb3s_own_ve
         both(lambda env, kind=kind: env.env_is_wrapped(kind, indices=[1, 2]))
     with pytest.raises(AttributeError, match="no 'step'; its methods are reset, get_state and set_state"):
         ours.env_method("step", action[0], indices=0)
-
-
-@pytest.mark.parametrize("observation", ["measured", "history", "state"])
-def test_stable_baselines3s_checker_on_every_scenario(observation):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for scenario in SCENARIOS:
-            check_env(gym.make("Cz-v0", scenario=scenario, observation=observation, horizon=600.0), warn=True)
 
 
 @pytest.mark.parametrize("form", ["vector_entry_point", "sync"])

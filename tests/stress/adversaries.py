@@ -37,5 +37,4 @@ class Adversaries:
         full, no, hot, cold, bang_heat = (np.stack(pair, axis=-1) for pair in pairs)
         uniform = random.uniform(-1.0, 1.0, (n, 2))
         by_kind = [uniform, self._bang, full, no, hot, cold, extreme, chatter, self._walk, bang_heat]
-        chosen = np.stack(by_kind)[self._kind, np.arange(n)]
-        return chosen
+        return np.stack(by_kind)[self._kind, np.arange(n)]

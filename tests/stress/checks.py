@@ -127,5 +127,4 @@ class Watch:
 def _losses(p, x):
     """Heat that insulation and melt surface lose [W]."""
     surface = p["kappa_b"] * (fourth_power(x["T_b"]) - fourth_power(p["T_e"]))
-    loss = p["G_1a"] * (x["T_1"] - p["T_a"]) + surface
-    return loss
+    return p["G_1a"] * (x["T_1"] - p["T_a"]) + surface
