@@ -10,7 +10,6 @@ from typing import Annotated, Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import pytest
-from cz_gym.testing.checker import check_vector_env
 from gymnasium.utils.env_checker import check_env as check_with_gymnasium
 from gymnasium.vector import AutoresetMode
 from scipy.integrate import solve_ivp
@@ -29,6 +28,7 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.runner import run_episodes
 from cz_gym.jit.compile import force_inlined, jittable
 from cz_gym.process import DONE, GROWS, LOST, PULL_SCALE, Channel, Inputs, Past, Process, Relative, Seen
+from cz_gym.testing.checker import check_vector_env
 
 # The process: at most 80 lines to the mark below.
 LEVEL, FALL, MM = Channel("m", 1e-3, "level above reference"), Channel("m/s", PULL_SCALE, "inflow above nominal"), 1e-3
