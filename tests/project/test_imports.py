@@ -4,9 +4,7 @@ A room is a package, or a module that stands beside packages (``cz_gym.env``, ``
 """
 
 import ast
-import os
 from graphlib import CycleError, TopologicalSorter
-from pathlib import Path
 
 import pytest
 
@@ -24,6 +22,8 @@ FORBIDDEN = {
 """Packages, and what nothing in each may import."""
 FOREIGN = "tests.foreign_puller"
 """The simulator that is not ours: a study may run it."""
+BESIDE = ("agents", "baselines")
+"""Folders beside ``cz_gym`` that are packages in it."""
 Arrows = set[tuple[str, str]]
 """Pairs of which the first imports from the second."""
 
@@ -31,10 +31,10 @@ Arrows = set[tuple[str, str]]
 def modules():
     """Every module by its one name."""
     found = {name: ROOT / f"{name}.py" for name in PROGRAMS}
-    for top in ("cz_gym", "studies"):
-        for place, _, names in os.walk(ROOT / top, followlinks=True):
-            for file in (Path(place) / name for name in names if name.endswith(".py")):
-                found[".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")] = file
+    for top in ("cz_gym", *BESIDE, "studies"):
+        for file in (ROOT / top).rglob("*.py"):
+            name = ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+            found[f"cz_gym.{name}" if top in BESIDE else name] = file
     return dict(sorted(found.items()))
 
 
@@ -66,8 +66,9 @@ def arrows():
 def room(name):
     """The room of a module: its package, or itself where packages stand beside it."""
     package = name.rpartition(".")[0]
-    folder = ROOT / name.replace(".", "/")
-    several = any((beside / "__init__.py").exists() for beside in folder.parent.iterdir())
+    beside = any(within(name, f"cz_gym.{each}") for each in BESIDE)
+    folder = ROOT / (name.removeprefix("cz_gym.") if beside else name).replace(".", "/")
+    several = any((each / "__init__.py").exists() for each in folder.parent.iterdir())
     return name if folder.is_dir() or several or not package else package
 
 

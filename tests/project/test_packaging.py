@@ -17,8 +17,8 @@ from tests.processes import ROOT, python
 
 SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT = SETTINGS["project"]
-LINKS = {"baselines": "cz_gym.baselines", "agents": "cz_gym.agents"}
-"""Folders that stand beside the package and are packages in it, by links in the checkout."""
+BESIDE = ("agents", "baselines")
+"""Folders that stand beside the package and are packages in it."""
 UNPACKED = {"build", "dist", "runs", "results", "venv", "__pycache__"}
 """Folders that no build needs, beside the hidden ones."""
 NAMES = """
@@ -69,12 +69,10 @@ def printed(code, place, cwd):
 
 
 def test_every_package_is_listed():
-    folders = {"cz_gym": ROOT / "cz_gym", **{package: ROOT / "cz_gym" / name for name, package in LINKS.items()}}
     found = {
-        ".".join((package, *file.parent.relative_to(folder).parts))
-        for package, folder in folders.items()
-        for file in folder.rglob("__init__.py")
-        if package != "cz_gym" or file.relative_to(folder).parts[0] not in LINKS
+        ".".join(("cz_gym", *file.parent.relative_to(ROOT / (top if top == "cz_gym" else ".")).parts))
+        for top in ("cz_gym", *BESIDE)
+        for file in (ROOT / top).rglob("__init__.py")
     }
     listed = SETTINGS["tool"]["setuptools"]["packages"]
     assert sorted(listed) == sorted(found)
@@ -110,10 +108,10 @@ def test_pins_lie_in_the_open_ranges(file):
         assert {requirement.name for requirement in requirements} == set(pins)
 
 
-def test_environment_and_baselines_need_neither_torch_nor_plots(tmp_path):
+def test_environment_and_baselines_need_neither_torch_nor_plots():
     absent = {"torch", "stable_baselines3", "sb3_contrib", "matplotlib", "onnxruntime", "onnx", "tensorboard"}
     absent |= {"control", "tqdm", "pygame", "casadi"}
-    printed(ABSENT.replace("{absent}", repr(absent)) + SMOKE, ROOT, tmp_path)
+    python("-W", "error", "-c", ABSENT.replace("{absent}", repr(absent)) + SMOKE, cwd=ROOT)
 
 
 @pytest.mark.parametrize("command", ["train.py", "benchmark.py", "-m studies.bode", "-m cz_gym.datasets"])
@@ -127,15 +125,13 @@ def test_outside_the_virtual_environment_one_line_says_so(command):
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
-    """A checkout as it is where there are no links, as on Windows: the files named as links hold where these lead."""
+    """A checkout, without what no build needs."""
     folder = tmp_path_factory.mktemp("source")
 
     def left_out(place, names):
-        return {name for name in names if name in UNPACKED or name[0] == "." or (Path(place) / name).is_symlink()}
+        return {name for name in names if name in UNPACKED or name[0] == "."}
 
     shutil.copytree(ROOT, folder, ignore=left_out, dirs_exist_ok=True)
-    for name in LINKS:
-        (folder / "cz_gym" / name).write_text(f"../{name}")
     return folder
 
 
@@ -149,7 +145,7 @@ def test_the_wheel_holds_one_package_and_what_it_needs(source, tmp_path):
     assert tops == {"cz_gym", "cz_gym_command.py"}
     parts = {part for name in names for part in Path(name).parts}
     assert not parts & {"tests", "studies", "examples", "docs", "results"}
-    shipped = [f"cz_gym/agents/models/{file.name}" for file in (ROOT / "cz_gym" / "agents" / "models").glob("*-*.*")]
+    shipped = [f"cz_gym/agents/models/{file.name}" for file in (ROOT / "agents" / "models").glob("*-*.*")]
     assert {"cz_gym/py.typed", *shipped} <= names
     assert len(shipped) > 10
     assert any(name.endswith("licenses/LICENSE") for name in names)
@@ -165,11 +161,10 @@ def test_the_wheel_holds_one_package_and_what_it_needs(source, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_editable_install_needs_no_links(source, tmp_path):
+def test_an_editable_install_finds_the_folders_beside_the_package(source, tmp_path):
     code = f"from setuptools.build_meta import build_editable\nbuild_editable({str(tmp_path)!r})"
     python("-c", code, cwd=source)
     with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as archive:
         archive.extractall(tmp_path / "installed")
     modules = ["cz_gym/__init__.py", "baselines/registry.py", "agents/agent_file/contract.py"]
     assert printed(NAMES, tmp_path / "installed", tmp_path) == [str(source / name) for name in modules]
-    assert len(printed(NAMES, ROOT, tmp_path)) == 3, "a bare checkout needs no install"
