@@ -6,8 +6,6 @@ of lognormal distribution, as the prior says. Each log is made under a PID of th
 excitation. Three LQGs of one design then run on the same crystals: told the truth, the identified file, the start.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile
@@ -107,7 +105,7 @@ def study(number: int, crystals: int) -> Row:
     start, truth = draw(number)
     with tempfile.TemporaryDirectory() as name:
         excited, passive = write_logs(truth, number, Path(name))
-        found, without = identify(read_log(excited), start), measure_excitation(read_log(passive), start)
+        found, without = identify(read_log(excited), start), measure_excitation([read_log(passive)], start)
         write_puller(found.puller, Path(name) / "my.toml")
         identified = read_puller(Path(name) / "my.toml")
     config = make_config(SCENARIO, observation="measured", action="direct", puller=truth)

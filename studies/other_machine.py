@@ -42,11 +42,11 @@ CASES: dict[str, dict[str, float]] = {
     "the machine is the model": {},
     "latency 4 s": {"camera_latency": 4.0},
     "heater's lag 10 s": {"heater_lag": 10.0},
-    "dead time 4 s": {"heater_dead_time": 4.0},
+    "dead time 5 s": {"heater_dead_time": 5.0},
     "pyrometer's filter 20 s": {"pyrometer_filter": 20.0},
     "camera's scale 1 % off": {"camera_scale": 1.01},
     "all of these": {
-        "camera_latency": 4.0, "heater_lag": 10.0, "heater_dead_time": 4.0, "pyrometer_filter": 20.0,
+        "camera_latency": 4.0, "heater_lag": 10.0, "heater_dead_time": 5.0, "pyrometer_filter": 20.0,
         "camera_scale": 1.01,
     },
 }  # fmt: skip

@@ -133,7 +133,7 @@ def identify(
     """
     logs = (log,) if isinstance(log, Log) else tuple(log)
     sds = _prior_sds(prior_sd or {})
-    pull, heater = map(float, np.sum([measure_excitation(each, start) for each in logs], axis=0))
+    pull, heater = measure_excitation(logs, start)
     free = (*((*HEATER, *LAGS) if heater >= 1.0 else ()), *(PULL if pull >= 1.0 else ()))
     model = Model((*free, *Noise._fields), start.parameters, meniscus, _lags_of(start, heater >= 1.0))
     sd, latency = np.array([sds[name] for name in model.names]), start.latency or 0.0

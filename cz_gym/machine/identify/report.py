@@ -92,8 +92,9 @@ def _moved(share: float) -> str:
     if share >= 1.0:
         return f"moves of its own, {share:.3g} times what is needed"
     return (
-        f"{share:.2g} of the moves that are needed. The readings explain the others, as a controller's moves, and such "
-        "a log misleads: the numbers of this drive were not estimated. `identify.Excited` makes the moves."
+        f"{share:.2g} of the moves that are needed (the pull speed's count only beside the heater's). The readings "
+        "explain the others, as a controller's moves, and such a log misleads: the numbers of this drive were not "
+        "estimated. `identify.Excited` makes the moves."
     )
 
 
