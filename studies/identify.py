@@ -68,6 +68,12 @@ class Row(NamedTuple):
         return [e.low <= getattr(self.truth.parameters, e.name) <= e.high for e in told]
 
 
+def wrong(random: np.random.Generator) -> dict[str, float]:
+    """Factors of the truth over a start file, lognormal, by parameter."""
+    sds = dict.fromkeys(HOT_ZONE, PRIOR_SD) | dict.fromkeys(MELT, MELT_SD)
+    return {name: float(np.exp(sd * random.standard_normal())) for name, sd in sds.items()}
+
+
 def draw(number: int) -> tuple[PullerFile, PullerFile]:
     """The start file and the truth of a puller."""
     random, default = np.random.default_rng([5, number]), Parameters()
@@ -81,8 +87,7 @@ def draw(number: int) -> tuple[PullerFile, PullerFile]:
         R_cr=3.2 * r_0,
         **{name: factor * getattr(default, name) for name, factor in scaled.items()},
     )
-    sds = dict.fromkeys(HOT_ZONE, PRIOR_SD) | dict.fromkeys(MELT, MELT_SD)
-    truth = {name: getattr(start, name) * np.exp(sd * random.standard_normal()) for name, sd in sds.items()}
+    truth = {name: getattr(start, name) * factor for name, factor in wrong(random).items()}
     file = PullerFile(f"puller {number}", start, heater_range=area * HEATER_RANGE)
     return file, replace(file, parameters=start._replace(**truth))
 

@@ -17,7 +17,7 @@ from cz_gym.support.names import unknown
 from .grid import Floats, Log, join, prepare, shift_drives
 from .model import LAM, Lags, Model, Noise, Predicted, sensitivities
 from .moves import measure_excitation
-from .verdict import misfits, whiteness
+from .verdict import misfits
 
 HEATER = ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b", "eps", "k_l")
 """Parameters of the path from the heater."""
@@ -113,11 +113,6 @@ class Identified:
     def delayed(self) -> bool:
         """Whether the heater's path has a delay that the model's equations do not have."""
         return any(e.trusted for e in self.estimates if e.name in LAGS and e.excited)
-
-    @property
-    def whiteness(self) -> tuple[float, float]:
-        """Probability of residuals as coloured as these if they were white: pyrometer, ring."""
-        return whiteness(self.errors[:, 0]), whiteness(self.errors[:, 1])
 
 
 def identify(

@@ -17,7 +17,7 @@ from cz_gym.machine.identify.excitation import CHIPS, SEQUENCE
 from cz_gym.machine.identify.grid import Log, prepare, shift_drives
 from cz_gym.machine.identify.model import LAM, Lags, Model, Noise, heating, predict, sensitivities
 from cz_gym.machine.identify.moves import measure_excitation
-from cz_gym.machine.identify.verdict import coloured, whiteness
+from cz_gym.machine.identify.verdict import coloured
 from cz_gym.machine.puller import DEFAULT
 from cz_gym.observation import decode
 from tests.foreign_puller import ForeignPuller, Operator, drive, write_log
@@ -124,7 +124,7 @@ def test_a_log_with_excitation_tells_the_hot_zone(found):
     changed = {name for name in Parameters._fields if getattr(learned, name) != getattr(Parameters(), name)}
     assert changed == set(told) - {"lam", *LAGS}, "what the log does not tell keeps its value"
     assert min(found.excitation) > 5.0
-    assert min(found.whiteness) > 0.01
+    assert max(map(coloured, found.errors.T)) < 0.1
 
 
 def test_a_log_of_a_controller_alone_tells_nothing(logs):
@@ -182,10 +182,8 @@ def test_excitation_stops_for_good_beyond_a_radius_error():
         Excited(agent)
 
 
-def test_whiteness_tells_white_from_coloured():
+def test_coloured_errors_are_told_from_white_ones_and_from_the_rotation_s():
     white = np.random.default_rng(1).standard_normal(2000)
     white[100:150] = np.nan
-    assert whiteness(white) > 0.01
-    assert whiteness(white[1:] + 0.3 * white[:-1]) < 1e-6
     ripple = np.sin(2.1 * np.arange(2000))
     assert coloured(white + ripple) < 0.15 < coloured(white[1:] + 0.3 * white[:-1])
