@@ -3,8 +3,6 @@
 Without arguments a simulated puller makes the log. docs/your-puller.md explains each step.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

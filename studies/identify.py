@@ -6,8 +6,6 @@ of lognormal distribution, as the prior says. Each log is made under a PID of th
 excitation. Three LQGs of one design then run on the same crystals: told the truth, the identified file, the start.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile
@@ -70,6 +68,12 @@ class Row(NamedTuple):
         return [e.low <= getattr(self.truth.parameters, e.name) <= e.high for e in told]
 
 
+def wrong(random: np.random.Generator) -> dict[str, float]:
+    """Factors of the truth over a start file, lognormal, by parameter."""
+    sds = dict.fromkeys(HOT_ZONE, PRIOR_SD) | dict.fromkeys(MELT, MELT_SD)
+    return {name: float(np.exp(sd * random.standard_normal())) for name, sd in sds.items()}
+
+
 def draw(number: int) -> tuple[PullerFile, PullerFile]:
     """The start file and the truth of a puller."""
     random, default = np.random.default_rng([5, number]), Parameters()
@@ -83,8 +87,7 @@ def draw(number: int) -> tuple[PullerFile, PullerFile]:
         R_cr=3.2 * r_0,
         **{name: factor * getattr(default, name) for name, factor in scaled.items()},
     )
-    sds = dict.fromkeys(HOT_ZONE, PRIOR_SD) | dict.fromkeys(MELT, MELT_SD)
-    truth = {name: getattr(start, name) * np.exp(sd * random.standard_normal()) for name, sd in sds.items()}
+    truth = {name: getattr(start, name) * factor for name, factor in wrong(random).items()}
     file = PullerFile(f"puller {number}", start, heater_range=area * HEATER_RANGE)
     return file, replace(file, parameters=start._replace(**truth))
 
@@ -107,7 +110,7 @@ def study(number: int, crystals: int) -> Row:
     start, truth = draw(number)
     with tempfile.TemporaryDirectory() as name:
         excited, passive = write_logs(truth, number, Path(name))
-        found, without = identify(read_log(excited), start), measure_excitation(read_log(passive), start)
+        found, without = identify(read_log(excited), start), measure_excitation([read_log(passive)], start)
         write_puller(found.puller, Path(name) / "my.toml")
         identified = read_puller(Path(name) / "my.toml")
     config = make_config(SCENARIO, observation="measured", action="direct", puller=truth)

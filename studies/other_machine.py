@@ -24,12 +24,13 @@ from cz_gym.machine.export.compiled import CompiledBlock
 from cz_gym.machine.export.controllers import make_block
 from cz_gym.machine.export.ports import OUTPUTS
 from cz_gym.machine.identify import Identified, identify, read_log
-from cz_gym.machine.identify.estimate import LAGS, PRIOR_SD
+from cz_gym.machine.identify.estimate import LAGS
 from cz_gym.machine.puller import PullerFile
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.support.atomic_files import check_writable, write_files
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN, PERCENT
+from studies.identify import HOT_ZONE, MELT, wrong
 from tests.foreign_puller import ZONE, ForeignPuller, Operator, drive, write_log
 
 SLOW = {
@@ -42,16 +43,15 @@ CASES: dict[str, dict[str, float]] = {
     "the machine is the model": {},
     "latency 4 s": {"camera_latency": 4.0},
     "heater's lag 10 s": {"heater_lag": 10.0},
-    "dead time 4 s": {"heater_dead_time": 4.0},
+    "dead time 5 s": {"heater_dead_time": 5.0},
     "pyrometer's filter 20 s": {"pyrometer_filter": 20.0},
     "camera's scale 1 % off": {"camera_scale": 1.01},
     "all of these": {
-        "camera_latency": 4.0, "heater_lag": 10.0, "heater_dead_time": 4.0, "pyrometer_filter": 20.0,
+        "camera_latency": 4.0, "heater_lag": 10.0, "heater_dead_time": 5.0, "pyrometer_filter": 20.0,
         "camera_scale": 1.01,
     },
 }  # fmt: skip
 """What the machine has besides; the start file knows the latency alone."""
-HOT_ZONE, MELT = ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b", "eps"), ("sigma", "k_l")
 MACHINES, CRYSTALS, SETTLING = 20, 5, 30.0 * MINUTE
 """Machines of the intervals, crystals of each case, and the time of each that does not count [s]."""
 
@@ -98,12 +98,8 @@ def log_of(zone: Mapping[str, float], quirks: Mapping[str, float], seed: int, **
 
 def drawn(number: int) -> dict[str, float]:
     """A machine whose hot zone the start file has wrong by factors of lognormal distribution."""
-    random = np.random.default_rng([11, number])
-    sds = dict.fromkeys(HOT_ZONE, PRIOR_SD) | dict.fromkeys(MELT, 0.1)
-    zone: dict[str, float] = ZONE | {
-        name: ZONE[name] * float(np.exp(sd * random.standard_normal())) for name, sd in sds.items()
-    }
-    return zone
+    zone: dict[str, float] = ZONE
+    return zone | {name: zone[name] * factor for name, factor in wrong(np.random.default_rng([11, number])).items()}
 
 
 def held(number: int) -> tuple[Identified, list[bool]]:

@@ -7,6 +7,7 @@ meniscus, Heun's moves the states. Numbers are SI inside; readings, setpoints an
 import csv
 import math
 from collections import deque
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -19,12 +20,14 @@ ZONE = {
 """A puller of 200 mm crystals [SI]."""
 QUIRKS = {
     "interval": 2.0, "feels": True, "heater_lag": 0.0, "heater_dead_time": 0.0, "heater_slew": math.inf,
-    "heater_step": 0.0, "heater_reach": 1e4, "pull_slew": math.inf, "pull_window": math.inf, "pyrometer_filter": 0.0,
+    "heater_step": 0.0, "pull_slew": math.inf, "pull_window": math.inf, "pyrometer_filter": 0.0,
     "pyrometer_noise": 0.1, "camera_noise": 0.03, "camera_latency": 0.0, "camera_scale": 1.0, "level_drift": 0.0,
-    "fast_sd": 0.25, "slow_sd": 0.25, "drift_K": 0.0,
 }  # fmt: skip
 """What the machine does: [s], [K], heater in [W] and [W/s], pull in [mm/min] and [mm/min per s], camera in [mm], level
 in [mm/h] of the ring; ``feels``: whether the heat that the crystal draws changes with it."""
+REACH, MELT = 1e4, ((30.0, 0.25), (780.0, 0.25))
+"""The heater's range about nominal [W]; times [s] and deviations [K] of the melt's fluctuations."""
+COLUMNS = "time_s", "ring_radius_mm", "pull_speed_mm_per_min", "heater_power_kW", "T_1_K"
 
 
 class ForeignPuller:
@@ -32,32 +35,31 @@ class ForeignPuller:
 
     def __init__(self, zone=(), seed=0, **quirks):
         assert not (unknown := (set(dict(zone)) - set(ZONE)) | (set(quirks) - set(QUIRKS))), unknown
-        self.z, self.q = ZONE | dict(zone), QUIRKS | quirks
-        z, self.random = self.z, np.random.default_rng(seed)
-        self.a2, self.rho_dH = 2 * z["sigma"] / z["rho_l"] / z["g"], z["rho_s"] * z["dH"]
-        self.h_0 = self._height(z["alpha_0"], z["r_0"])
-        melt = z["T_m"] + z["dT_0"]
-        flux = z["k_l"] * z["dT_0"] / self.h_0
-        self.solid_flux, self.draw_0 = self.rho_dH * z["v_0"] + flux, math.pi * z["r_0"] ** 2 * flux
-        through = self._loss(z["r_0"], melt) + self.draw_0
-        T_2 = melt + through / z["G_2b"]
-        T_1 = (T_2**4 + through / z["kappa_12"]) ** 0.25
-        self.power_0, self.T_1_0 = through + z["G_1a"] * (T_1 - z["T_a"]), T_1
-        self.x = np.array([z["r_0"] + 2e-4 * self.random.standard_normal(), self.h_0, T_1, T_2, melt])
+        self.z = z = SimpleNamespace(**ZONE | dict(zone))
+        self.q = q = SimpleNamespace(**QUIRKS | quirks)
+        self.random = np.random.default_rng(seed)
+        self.a2, self.rho_dH = 2 * z.sigma / z.rho_l / z.g, z.rho_s * z.dH
+        self.h_0, melt = self._height(z.alpha_0, z.r_0), z.T_m + z.dT_0
+        flux = z.k_l * z.dT_0 / self.h_0
+        self.solid_flux, self.draw_0 = self.rho_dH * z.v_0 + flux, math.pi * z.r_0**2 * flux
+        through = self._loss(z.r_0, melt) + self.draw_0
+        T_2 = melt + through / z.G_2b
+        self.T_1_0 = (T_2**4 + through / z.kappa_12) ** 0.25
+        self.power_0 = through + z.G_1a * (self.T_1_0 - z.T_a)
+        self.x = np.array([z.r_0 + 2e-4 * self.random.standard_normal(), self.h_0, self.T_1_0, T_2, melt])
         self.asked = self.power = self.heat = self.power_0
-        self.pull, self.shown, self.time, self.fluctuation = z["v_0"], T_1, 0.0, [0.0, 0.0]
-        step = self.q["interval"]
-        self.on_the_way = deque([self.power_0] * round(self.q["heater_dead_time"] / step))
-        self.ring_bias = self.q["camera_scale"] * (z["r_0"] + self._ring(z["r_0"], self.h_0)) - z["r_0"]
-        self.frames = deque([self._frame()] * (1 + round(self.q["camera_latency"] / step)))
-        self.lost = False
+        self.pull, self.shown, self.time, self.fluctuation = z.v_0, self.T_1_0, 0.0, [0.0, 0.0]
+        self.parts, self.lost = math.ceil(q.interval), False
+        self.on_the_way = deque([self.power_0] * round(q.heater_dead_time / q.interval * self.parts))
+        self.ring_bias = q.camera_scale * (z.r_0 + self._ring(z.r_0, self.h_0)) - z.r_0
+        self.frames = deque([self._frame()] * (1 + round(q.camera_latency / q.interval)))
 
     def _height(self, theta, r):
         m = self.a2 * math.cos(theta) / (4 * r)
         return math.sqrt(m * m + self.a2 * (1 - math.sin(theta))) - m
 
     def _angle(self, h, r):
-        theta = self.z["alpha_0"]
+        theta = self.z.alpha_0
         for _ in range(20):
             slope = (self._height(theta + 1e-6, r) - self._height(theta - 1e-6, r)) / 2e-6
             step = (self._height(theta, r) - h) / slope
@@ -72,60 +74,60 @@ class ForeignPuller:
         def reach(z):
             return M / math.sqrt(2) * math.acosh(math.sqrt(2) * M / z) - math.sqrt(2 * M * M - z * z)
 
-        return reach(M * math.sqrt(1 - math.cos(self.z["phi_b"]))) - reach(h)
+        return reach(M * math.sqrt(1 - math.cos(self.z.phi_b))) - reach(h)
 
     def _loss(self, r, T_b):
         z = self.z
-        return z["eps"] * z["sigma_SB"] * math.pi * (z["R_cr"] ** 2 - r * r) * (T_b**4 - z["T_e"] ** 4)
+        return z.eps * z.sigma_SB * math.pi * (z.R_cr**2 - r * r) * (T_b**4 - z.T_e**4)
 
     def _slopes(self, x):
         z, (r, h, T_1, T_2, T_b) = self.z, x
-        hot = z["k_l"] * (T_b + sum(self.fluctuation) - z["T_m"])
-        flux = hot * (z["lam"] / h + (1 - z["lam"]) / self.h_0)
-        growth, radiated = (self.solid_flux - flux) / self.rho_dH, z["kappa_12"] * (T_1**4 - T_2**4)
-        draw, loss = (math.pi * r * r * flux, self._loss(r, T_b)) if self.q["feels"] else (
-            self.draw_0, self._loss(z["r_0"], T_b))  # fmt: skip
-        wall, extra = z["G_2b"] * (T_2 - T_b), self.q["drift_K"] * z["G_2b"] * min(self.time / 10800, 1.0)
+        flux = z.k_l * (T_b + sum(self.fluctuation) - z.T_m) * (z.lam / h + (1 - z.lam) / self.h_0)
+        growth, radiated = (self.solid_flux - flux) / self.rho_dH, z.kappa_12 * (T_1**4 - T_2**4)
+        draw, wide = (math.pi * r * r * flux, r) if self.q.feels else (self.draw_0, z.r_0)
+        wall = z.G_2b * (T_2 - T_b)
         return np.array([
-            growth * math.tan(self._angle(h, r) - z["alpha_0"]), self.pull - growth,
-            (self.heat - radiated - z["G_1a"] * (T_1 - z["T_a"])) / z["C_1"], (radiated - wall) / z["C_2"],
-            (wall - loss - draw + extra) / z["C_b"],
+            growth * math.tan(self._angle(h, r) - z.alpha_0), self.pull - growth,
+            (self.heat - radiated - z.G_1a * (T_1 - z.T_a)) / z.C_1, (radiated - wall) / z.C_2,
+            (wall - self._loss(wide, T_b) - draw) / z.C_b,
         ])  # fmt: skip
 
     def _frame(self):
         q, (r, h) = self.q, self.x[:2]
-        ring = q["camera_scale"] * (r + self._ring(r, h)) * 1e3 + q["level_drift"] * self.time / 3600
-        return self.time, ring + q["camera_noise"] * self.random.standard_normal()
+        ring = q.camera_scale * (r + self._ring(r, h)) * 1e3 + q.level_drift * self.time / 3600
+        return self.time, ring + q.camera_noise * self.random.standard_normal()
 
     def _drives(self, setpoints):
-        q, v_0, dt = self.q, self.z["v_0"] * 6e4, self.q["interval"]
-        room, most = min(q["pull_window"], v_0), q["pull_slew"] * dt
-        wanted = np.clip(setpoints["pull_speed_setpoint_mm_per_min"], v_0 - room, v_0 + room)
-        self.pull = float(np.clip(wanted, self.pull * 6e4 - most, self.pull * 6e4 + most)) / 6e4
-        room, most = q["heater_reach"], q["heater_slew"] * dt
-        wanted = np.clip(setpoints["heater_power_setpoint_kW"] * 1e3, self.power_0 - room, self.power_0 + room)
-        self.asked = float(np.clip(wanted, self.asked - most, self.asked + most))
-        self.power = round(self.asked / q["heater_step"]) * q["heater_step"] if q["heater_step"] else self.asked
-        self.on_the_way.append(self.power)
-        return self.on_the_way.popleft()
+        q, v_0, dt = self.q, self.z.v_0 * 6e4, self.q.interval
+
+        def move(tag, now, middle, room, most, unit=1.0):
+            wanted = np.clip(setpoints[tag] * unit, middle - room, middle + room)
+            return float(np.clip(wanted, now - most, now + most))
+
+        pull = self.pull * 6e4, v_0, min(q.pull_window, v_0), q.pull_slew * dt
+        self.pull = move("pull_speed_setpoint_mm_per_min", *pull) / 6e4
+        heater = self.asked, self.power_0, REACH, q.heater_slew * dt
+        self.asked = move("heater_power_setpoint_kW", *heater, 1e3)
+        self.power = round(self.asked / q.heater_step) * q.heater_step if q.heater_step else self.asked
 
     def step(self, setpoints):
         """Apply setpoints for one interval; the readings after it, by the names of a plant's tags."""
-        arrives, q, parts = self._drives(setpoints), self.q, math.ceil(self.q["interval"])
-        dt = q["interval"] / parts
-        follow = [1 - math.exp(-dt / tau) if tau else 1.0 for tau in (q["heater_lag"], q["pyrometer_filter"])]
-        for _ in range(parts):
-            self.heat += follow[0] * (arrives - self.heat)
+        self._drives(setpoints)
+        q, dt = self.q, self.q.interval / self.parts
+        follow = [1 - math.exp(-dt / tau) if tau else 1.0 for tau in (q.heater_lag, q.pyrometer_filter)]
+        for _ in range(self.parts):
+            self.on_the_way.append(self.power)
+            self.heat += follow[0] * (self.on_the_way.popleft() - self.heat)
             first = self._slopes(self.x)
             self.x = self.x + dt / 2 * (first + self._slopes(self.x + dt * first))
             self.shown += follow[1] * (self.x[2] - self.shown)
-            for i, (tau, sd) in enumerate(((30.0, q["fast_sd"]), (780.0, q["slow_sd"]))):
+            for i, (tau, sd) in enumerate(MELT):
                 keep = math.exp(-dt / tau)
                 kick = sd * math.sqrt(1 - keep * keep) * self.random.standard_normal()
                 self.fluctuation[i] = keep * self.fluctuation[i] + kick
             self.time += dt
             r, h = self.x[:2]
-            self.lost = not (abs(r - self.z["r_0"]) < 8e-3 and 1.2e-3 < h < 1.24 * math.sqrt(self.a2))
+            self.lost = not (abs(r - self.z.r_0) < 8e-3 and 1.2e-3 < h < 1.24 * math.sqrt(self.a2))
             if self.lost:
                 return self.readings()
         self.frames.append(self._frame())
@@ -134,69 +136,57 @@ class ForeignPuller:
 
     def readings(self):
         """What a control computer sees."""
-        (at, ring), z = self.frames[0], self.z
-        previews = ("", "_1min", "_5min")
-        return {
-            "time_s": self.time, "ring_time_s": at, "ring_radius_mm": ring, "valid": 1.0,
-            **{f"r_ref{p}_mm": z["r_0"] * 1e3 for p in previews}, **{f"T_1_ref{p}_K": self.T_1_0 for p in previews},
-            "T_1_K": self.shown + self.q["pyrometer_noise"] * self.random.standard_normal(),
-            "pull_speed_mm_per_min": self.pull * 6e4, "heater_power_kW": self.power / 1e3,
-        }  # fmt: skip
+        (at, ring), r_ref = self.frames[0], self.z.r_0 * 1e3
+        T_1 = self.shown + self.q.pyrometer_noise * self.random.standard_normal()
+        seen = dict(zip(COLUMNS, (self.time, ring, self.pull * 6e4, self.power / 1e3, T_1), strict=True))
+        for ahead in ("", "_1min", "_5min"):
+            seen |= {f"r_ref{ahead}_mm": r_ref, f"T_1_ref{ahead}_K": self.T_1_0}
+        return seen | {"ring_time_s": at, "valid": 1.0}
 
 
 class Operator:
     """A slow PID by hand, and small moves up and down in a random order on both drives (shares of nominal)."""
 
-    def __init__(self, puller, seed=0, moves=(0.025, 0.025), clock=60.0):
-        chips = np.random.default_rng([9, seed]).choice((-1.0, 1.0), (1000, 2))
-        self.puller, self.moves, self.chips, self.clock, self.smooth, self.trim = puller, moves, chips, clock, None, 0.0
+    def __init__(self, puller, seed=0, moves=(0.025, 0.025)):
+        self.chips = moves * np.random.default_rng([9, seed]).choice((-1.0, 1.0), (1000, 2))
+        self.puller, self.smooth, self.trim = puller, None, 0.0
 
     def setpoints(self, seen):
         """Setpoints for readings."""
-        p, dt = self.puller, self.puller.q["interval"]
+        p, dt, v_0 = self.puller, self.puller.q.interval, self.puller.z.v_0 * 6e4
         error = seen["ring_radius_mm"] - 1e3 * p.ring_bias - seen["r_ref_mm"]
         last = self.smooth = error if self.smooth is None else self.smooth
         self.smooth += dt / 60.0 * (error - self.smooth)
-        pull = p.z["v_0"] * 6e4 * (0.1 * self.smooth + 25.0 * (self.smooth - last) / dt)
+        pull = v_0 * (0.1 * self.smooth + 25.0 * (self.smooth - last) / dt)
         self.trim += dt / 1800.0 * 2.0 * pull
-        kick = self.moves * self.chips[int(seen["time_s"] / self.clock) % 1000]
-        heater = p.power_0 * (1 + kick[1]) / 1e3 + 0.5 * (p.T_1_0 + self.trim - seen["T_1_K"])
-        return {
-            "pull_speed_setpoint_mm_per_min": p.z["v_0"] * 6e4 * (1 + kick[0]) + pull,
-            "heater_power_setpoint_kW": heater,
-        }
+        kick = 1 + self.chips[int(seen["time_s"] / 60.0) % 1000]
+        heater = p.power_0 * kick[1] / 1e3 + 0.5 * (p.T_1_0 + self.trim - seen["T_1_K"])
+        return {"pull_speed_setpoint_mm_per_min": v_0 * kick[0] + pull, "heater_power_setpoint_kW": heater}
 
 
 def drive(puller, setpoints, hours=3.0):
     """Rows of readings, with the setpoints that follow each of them; ``setpoints`` is a function of readings."""
     rows, seen = [], puller.readings()
-    for _ in range(round(hours * 3600 / puller.q["interval"])):
+    while len(rows) < round(hours * 3600 / puller.q.interval) and not puller.lost:
         asked = setpoints(seen)
         rows.append(seen | asked | {"true_radius_mm": puller.x[0] * 1e3})
         seen = puller.step(asked)
-        if puller.lost:
-            break
     return rows
 
 
-def write_log(path, rows, seed=0, second=0.0, jitter=0.0, missing_rows=0.0, missing_drives=0.0, digits=(), after=False):
-    """Write rows as a PLC historian does, stamps in multiples of ``second``, ``digits`` decimals of ring, pull, power
-    and T_1; ``after``: a row's drives are those that its action sets, not those that have acted since the row before.
-    """
+def write_log(path, rows, seed=0, second=0.0, jitter=0.0, missing_rows=0.0, missing_drives=0.0, digits=()):
+    """Write rows as a PLC historian does, stamps in multiples of ``second``, ``digits`` decimals of the readings."""
     random = np.random.default_rng([7, seed])
-    names = "time_s", "ring_radius_mm", "pull_speed_mm_per_min", "heater_power_kW", "T_1_K"
     with open(path, "w", newline="") as file:
         out = csv.writer(file)
-        out.writerow(names)
-        for row, late in zip(rows, [*rows[1:], rows[-1]], strict=True):
-            values = [row[name] for name in names]
-            values[2:4] = [late[name] for name in names[2:4]] if after else values[2:4]
-            values[0] += jitter * random.uniform(-1, 1)
-            values[0] = round(values[0] / second) * second if second else values[0]
-            for j, places in enumerate(digits, 1):
-                values[j] = round(values[j], places)
-            for j in (2, 3):
+        out.writerow(COLUMNS)
+        for row in rows:
+            time, *values = (row[name] for name in COLUMNS)
+            time += jitter * random.uniform(-1, 1)
+            time = round(time / second) * second if second else time
+            values = [round(value, places) for value, places in zip(values, digits, strict=True)] if digits else values
+            for j in (1, 2):
                 values[j] = "" if random.random() < missing_drives and row is not rows[0] else values[j]
             if random.random() >= missing_rows or row is rows[0]:
-                out.writerow(values)
+                out.writerow([time, *values])
     return path

@@ -17,7 +17,7 @@ from cz_gym.support.names import unknown
 from .grid import Floats, Log, join, prepare, shift_drives
 from .model import LAM, Lags, Model, Noise, Predicted, sensitivities
 from .moves import measure_excitation
-from .verdict import misfits, whiteness
+from .verdict import misfits
 
 HEATER = ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b", "eps", "k_l")
 """Parameters of the path from the heater."""
@@ -114,11 +114,6 @@ class Identified:
         """Whether the heater's path has a delay that the model's equations do not have."""
         return any(e.trusted for e in self.estimates if e.name in LAGS and e.excited)
 
-    @property
-    def whiteness(self) -> tuple[float, float]:
-        """Probability of residuals as coloured as these if they were white: pyrometer, ring."""
-        return whiteness(self.errors[:, 0]), whiteness(self.errors[:, 1])
-
 
 def identify(
     log: Log | Sequence[Log],
@@ -133,7 +128,7 @@ def identify(
     """
     logs = (log,) if isinstance(log, Log) else tuple(log)
     sds = _prior_sds(prior_sd or {})
-    pull, heater = map(float, np.sum([measure_excitation(each, start) for each in logs], axis=0))
+    pull, heater = measure_excitation(logs, start)
     free = (*((*HEATER, *LAGS) if heater >= 1.0 else ()), *(PULL if pull >= 1.0 else ()))
     model = Model((*free, *Noise._fields), start.parameters, meniscus, _lags_of(start, heater >= 1.0))
     sd, latency = np.array([sds[name] for name in model.names]), start.latency or 0.0

@@ -4,8 +4,6 @@ A log of a controller alone cannot tell what the pull speed does, because every 
 answer nothing make it identifiable.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 

@@ -6,6 +6,7 @@ window, on the readings alone, and what the drive has done besides counts: a slo
 moved by a minute's ramp, whatever a row of its log shows.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -57,12 +58,18 @@ class Law(NamedTuple):
         return last
 
 
-def measure_excitation(log: Log, start: PullerFile = DEFAULT) -> tuple[float, float]:
-    """How much pull speed and heater move on their own, in multiples of what is needed [-]."""
-    errors = np.stack([log.ring - np.nan_to_num(log.r_ref), log.T_1 - np.nan_to_num(log.T_1_ref)], axis=1)
-    pull, heater = log.v_p / start.parameters.v_0, log.Q_H / np.median(log.Q_H)
-    own = (float(np.square(_unexplained(drive, errors, log)).sum()) for drive in (pull, heater))
-    return next(own) / ENOUGH[0], next(own) / ENOUGH[1]
+def measure_excitation(logs: Sequence[Log], start: PullerFile = DEFAULT) -> tuple[float, float]:
+    """How much pull speed and heater move on their own in all logs together, in multiples of what is needed [-].
+
+    The pull speed counts only where the heater does too: a controller with gates and nested limits moves it in ways
+    that no linear law explains, up to 25 times what is needed, but not the slow heater.
+    """
+    pull = heater = 0.0
+    for log in logs:
+        errors = np.stack([log.ring - np.nan_to_num(log.r_ref), log.T_1 - np.nan_to_num(log.T_1_ref)], axis=1)
+        pull += float(np.square(_unexplained(log.v_p / start.parameters.v_0, errors, log)).sum()) / ENOUGH[0]
+        heater += float(np.square(_unexplained(log.Q_H / np.median(log.Q_H), errors, log)).sum()) / ENOUGH[1]
+    return (pull if heater >= 1.0 else 0.0), heater
 
 
 def _unexplained(drive: Floats, readings: Floats, log: Log) -> Floats:

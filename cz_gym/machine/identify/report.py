@@ -14,8 +14,9 @@ from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN, PERCENT
 from .estimate import Estimate, Identified
 from .grid import Log
 from .model import Lags
-from .verdict import WHITE
+from .verdict import COLOURED, coloured
 
+SENSORS = "pyrometer", "ring"
 CALLIPER = 0.05 * MM
 """Error of a calliper's reading of the radius [m]."""
 OTHERS = {
@@ -37,9 +38,10 @@ def report(found: Identified, log: Log | Sequence[Log], source: str, path: Path)
     """The files of a report, its text at ``path``: what the log ``source`` tells of a puller, and what it does not."""
     readings, numbers = (path.with_name(f"{path.stem}-{name}.png") for name in ("readings", "numbers"))
     told, moves = sum(e.informed for e in found.estimates), zip(("pull speed", "heater"), found.excitation, strict=True)
-    white = zip(("pyrometer", "ring"), found.whiteness, strict=True)
+    correlations = [f"{name} {coloured(errors):.2f}" for name, errors in zip(SENSORS, found.errors.T, strict=True)]
     logs = (log,) if isinstance(log, Log) else log
-    lines = [f"- {len(each.time)} rows of {each.interval:g} s; {_notes(each)}." for each in logs]
+    notes = ["; ".join(each.notes) or "nothing was left out" for each in logs]
+    lines = [f"- {len(each.time)} rows of {each.interval:g} s; {note}." for each, note in zip(logs, notes, strict=True)]
     text = f"""# {found.verdict[0].upper() + found.verdict[1:]}
 
 The log {source} tells {told} of {len(found.estimates)} numbers of the puller {found.start.name}; the others keep the
@@ -60,7 +62,8 @@ A log gives lam and dT_0 only as their product, the delays of the heater's path 
 
 ![readings and their prediction errors]({readings.name})
 
-{chr(10).join(f"- {name}: {_whiteness(p)}" for name, p in white)}
+Largest correlation of the prediction errors: {", ".join(correlations)}. Above {COLOURED:g} something moves the readings
+that the model does not have.
 
 ## What one calliper reading would add
 
@@ -71,10 +74,6 @@ A log gives lam and dT_0 only as their product, the delays of the heater's path 
 {chr(10).join(lines)}
 """
     return {path: text.encode(), readings: _readings(found), numbers: _numbers(found)}
-
-
-def _notes(log: Log) -> str:
-    return "; ".join(log.notes) or "nothing was left out"
 
 
 def _row(e: Estimate) -> tuple[str, ...]:
@@ -92,17 +91,9 @@ def _moved(share: float) -> str:
     if share >= 1.0:
         return f"moves of its own, {share:.3g} times what is needed"
     return (
-        f"{share:.2g} of the moves that are needed. The readings explain the others, as a controller's moves, and such "
-        "a log misleads: the numbers of this drive were not estimated. `identify.Excited` makes the moves."
-    )
-
-
-def _whiteness(probability: float) -> str:
-    if probability >= WHITE:
-        return f"the prediction errors are white (p = {probability:.2g}), so the model explains the readings"
-    return (
-        f"the prediction errors are **not white** (p = {probability:.1g}): something moves the readings that the model "
-        "does not have, and the intervals may be too narrow"
+        f"{share:.2g} of the moves that are needed (the pull speed's count only beside the heater's). The readings "
+        "explain the others, as a controller's moves, and such a log misleads: the numbers of this drive were not "
+        "estimated. `identify.Excited` makes the moves."
     )
 
 
@@ -135,7 +126,7 @@ def _readings(found: Identified) -> bytes:
         axis.plot(hours, values / size, ".", color=GREY, ms=2, label="measured")
         axis.plot(hours, (values - error) / size, color=COLOURS[1], lw=0.8, label="predicted")
         axis.set_ylabel(label)
-    for sensor, name in enumerate(("pyrometer", "ring")):
+    for sensor, name in enumerate(SENSORS):
         errors.plot(hours, found.errors[:, sensor], ".", color=COLOURS[sensor], ms=2, label=name)
     drives.set_ylabel("pull speed [mm/min]", color=COLOURS[1])
     power.set_ylabel("heater power [kW]", color=COLOURS[0])

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from cz_gym.errors import CzError
 from cz_gym.support.units import KILO, MM
@@ -12,10 +11,9 @@ from cz_gym.support.units import KILO, MM
 from .grid import Floats
 from .model import Lags
 
-LAGS, WHITE = 20, 0.01
-"""Lags of the whiteness test, and the probability below which residuals count as coloured."""
-COLOURED = 0.15
-"""Correlation of prediction errors above which the model does not fit [-]; many rows make smaller ones significant."""
+LAGS, COLOURED = 20, 0.15
+"""Lags at which prediction errors are correlated [rows], and the correlation above which the model does not fit [-];
+many rows make smaller ones significant."""
 FAR = 3.0
 """Standard deviations of its prior from which on an estimate stands at its end."""
 T_1_OFF, Q_H_OFF = 15.0, 0.06
@@ -64,22 +62,15 @@ def misfits(found: Any, puller: Any, away: Mapping[str, float]) -> tuple[str, ..
     return tuple(reasons)
 
 
-def whiteness(errors: Floats) -> float:
-    """Ljung and Box's probability over LAGS lags; NaN errors are where nothing was read."""
-    r, n = _correlations(errors), int(np.isfinite(errors).sum())
-    return float(chi2.sf(n * (n + 2) * np.sum(np.square(r) / (n - np.arange(1, LAGS + 1))), LAGS))
-
-
 def coloured(errors: Floats) -> float:
-    """Largest correlation of errors within LAGS rows, without their strongest line, which may be the rotation's [-]."""
+    """Largest correlation of errors within LAGS rows [-], without their strongest line, which may be the rotation's.
+
+    Errors are NaN where nothing was read.
+    """
     u = np.nan_to_num(errors - np.nanmean(errors))
     spectrum = np.fft.rfft(u)
     peak = int(np.abs(spectrum).argmax())
     spectrum[max(peak - 1, 0) : peak + 2] = 0.0
-    return float(np.abs(_correlations(np.fft.irfft(spectrum, len(u)))).max())
-
-
-def _correlations(errors: Floats) -> Floats:
-    u = np.nan_to_num(errors - np.nanmean(errors))
-    r: Floats = np.array([u[lag:] @ u[:-lag] for lag in range(1, LAGS + 1)]) / (u @ u)
-    return r
+    u = np.fft.irfft(spectrum, len(u))
+    u -= u.mean()
+    return float(max(abs(u[lag:] @ u[:-lag]) for lag in range(1, LAGS + 1)) / (u @ u))
