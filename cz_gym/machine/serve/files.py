@@ -109,8 +109,8 @@ class StateFile:
             with np.load(io.BytesIO(content), allow_pickle=False) as file:
                 arrays = dict(file)
             facts, memory = json.loads(arrays.pop("facts").item()), arrays.pop("memory")
-            identity = Identity(*(tuple(each) if isinstance(each, list) else each for each in facts["identity"]))
-            slot = SlotState(identity, scenario=facts["scenario"], **arrays)
+            identity: Any = (tuple(each) if isinstance(each, list) else each for each in facts["identity"])
+            slot = SlotState(Identity(*identity), scenario=facts["scenario"], **arrays)
             return State(EnvState(slot, facts["random"]), memory, facts["attributes"], facts["tags"])
         except Exception:  # a damaged file can raise anything
             raise CzError(f"{self.path}: no state of a virtual puller, or one of another version") from None
