@@ -1,11 +1,9 @@
 """From a policy of stable-baselines3 to an ONNX model: normalisation, network and clipping in one graph."""
 
-from __future__ import annotations
-
 import io
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import onnx
@@ -13,19 +11,18 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from cz_gym.agents.agent_file.contract import PLANT, REWARD, STATE, AgentFileError, facts_of, make_contract
+from cz_gym.agents.agent_file.contract import AgentFileError, facts_of, make_contract
 from cz_gym.agents.agent_file.graph import INPUTS, OUTPUTS
 from cz_gym.agents.apg import APG, RecurrentPolicy
 from cz_gym.agents.asymmetric import Asymmetric
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.config import Config
+from cz_gym.evaluation.contender import PLANT, REWARD, STATE
 from cz_gym.observation import OBSERVATIONS
 from cz_gym.sb3 import environment_steps
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecNormalize
 
 OPSET, IR_VERSION = 17, 9
 

@@ -52,21 +52,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return parser.run(_play, arguments, "render")
 
 
-def settings(arguments: argparse.Namespace) -> Config:
-    """The environment's settings."""
-    length, puller = arguments.minutes * MINUTE, chosen_puller(arguments.puller)
-    return make_config(arguments.scenario, None, "measured", horizon=length, action="rate", puller=puller)
-
-
 def keys() -> dict[tuple[int, ...], Action]:
     """The action of each combination of keys."""
-    k, actions = load(), {}
-    pulls, heats, shifts = ((0.0, 0), (STEP, k.K_UP), (-STEP, k.K_DOWN)), (0.0, STEP, -STEP), (1.0, 10.0)
-    for (pull, key), (heat, other), large in product(pulls, zip(heats, (0, k.K_RIGHT, k.K_LEFT), strict=True), shifts):
-        shift = k.K_LSHIFT if large > 1.0 else 0
-        pressed = tuple(sorted(one for one in (key, other, shift) if one))
-        if pressed:
-            actions[pressed] = np.array([large * pull, large * heat], np.float32)
+    k, actions = load(), dict[tuple[int, ...], Action]()
+    for pull, heat, large in product((0, 1, -1), (0, 1, -1), (1, 10)):
+        held = {k.K_UP: pull > 0, k.K_DOWN: pull < 0, k.K_RIGHT: heat > 0, k.K_LEFT: heat < 0, k.K_LSHIFT: large > 1}
+        actions[tuple(sorted(key for key in held if held[key]))] = np.array([pull, heat], np.float32) * STEP * large
+    del actions[()]  # without a key the drives stay
     return actions
 
 
@@ -89,7 +81,8 @@ def score(config: Config, seed: int, actions: Sequence[Action], failed: bool) ->
 
 
 def _play(arguments: argparse.Namespace) -> None:
-    config, pygame = settings(arguments), load()
+    length, puller, pygame = arguments.minutes * MINUTE, chosen_puller(arguments.puller), load()
+    config = make_config(arguments.scenario, None, "measured", horizon=length, action="rate", puller=puller)
     if sys.platform.startswith(("linux", "freebsd")) and not any(map(os.environ.get, DISPLAYS)):
         raise CzError(NO_DISPLAY)
     pygame.display.init()

@@ -4,8 +4,6 @@
 the package imports it.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -140,7 +138,7 @@ class CzVecEnv(VecEnv):
         """Whether the slots do what a wrapper does: each reports its episodes as ``Monitor`` does."""
         return [wrapper_class is Monitor for _ in self._at(indices)]
 
-    def _at(self, indices: Any) -> list[Slot]:
+    def _at(self, indices: Any) -> "list[Slot]":
         return [self.slots[i] for i in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:

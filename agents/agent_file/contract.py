@@ -12,9 +12,6 @@ from typing import Any
 
 from cz_gym.config import Config
 from cz_gym.errors import CzError
-from cz_gym.evaluation.contender import PLANT as PLANT
-from cz_gym.evaluation.contender import REWARD as REWARD
-from cz_gym.evaluation.contender import STATE as STATE
 from cz_gym.machine.puller import DEFAULT
 from cz_gym.observation import CLIP, OBSERVATIONS
 from cz_gym.support.atomic_files import write_files
@@ -58,7 +55,7 @@ class Contract:
     algorithm: str
     """Name of the recipe that trained it."""
     learned_from: str
-    """:data:`REWARD` alone; that and the true :data:`STATE`, told in training; or the :data:`PLANT`'s equations."""
+    """What it was told in training, in words of :mod:`cz_gym.evaluation.contender`: REWARD, STATE or PLANT."""
     training_seed: int
     """Seed of the training run."""
     training_steps: int
@@ -190,6 +187,4 @@ def _wrong(kind: Any, value: Any) -> str | None:
         return str(kind.__name__)
     if isinstance(value, int):
         return None if 0 <= value <= MAX_WHOLE else f"between 0 and {MAX_WHOLE}"
-    if not math.isfinite(value):
-        return "finite"
-    return None if value >= 0.0 else "at least 0"
+    return None if 0.0 <= value < math.inf else "finite and at least 0"

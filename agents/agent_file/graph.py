@@ -51,9 +51,8 @@ def checked(onnx_bytes: bytes, channels: int) -> tuple[bytes, int]:
         return clean.SerializeToString(), state
     except GraphError:
         raise
-    except (ProtobufError, onnx.checker.ValidationError, onnx.shape_inference.InferenceError):
-        raise GraphError("not a sound ONNX model") from None
-    except (ValueError, TypeError, RuntimeError, RecursionError, OverflowError):
+    except (ProtobufError, onnx.checker.ValidationError, onnx.shape_inference.InferenceError,
+            ValueError, TypeError, RuntimeError, OverflowError):  # fmt: skip
         raise GraphError("not a sound ONNX model") from None
 
 
@@ -93,7 +92,8 @@ def _clean(graph: Any, channels: int) -> tuple[Any, int]:
     uses = [weights[name].size for node in graph.node for name in node.input if name in weights]
     if sum(uses) > MAX_PARAMETERS:
         raise GraphError(f"computes with more than {MAX_PARAMETERS} weights")
-    state = _state_length([*graph.input], [*graph.output])
+    length = _width(graph.input[1]) if len(graph.input) == len(graph.output) == 2 else 0
+    state = length if 0 < length <= MAX_ACTIVATIONS else 0
 
     def values(given: Any, names: tuple[str, str], sizes: tuple[int, int]) -> list[Any]:
         widths = {name: size for name, size in zip(names, sizes, strict=True) if size}
@@ -146,12 +146,6 @@ def _width(value: Any) -> int:
     if not floats or len(dims) != 2 or dims[0].HasField("dim_value") or not dims[1].HasField("dim_value"):
         return 0
     return int(dims[1].dim_value)
-
-
-def _state_length(inputs: list[Any], outputs: list[Any]) -> int:
-    both = len(inputs) == 2 and len(outputs) == 2
-    length = _width(inputs[1]) if both else 0
-    return length if 0 < length <= MAX_ACTIVATIONS else 0
 
 
 def _check_shapes(graph: Any) -> None:

@@ -5,10 +5,8 @@ of the cost by the policy's weights: back-propagation through time over windows 
 that is estimated from rewards. The method knows the plant's equations while it trains; the policy reads sensors alone.
 """
 
-from __future__ import annotations
-
 import math
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -32,7 +30,6 @@ CLIP_AT = 2.0
 thousands of times as large."""
 NORMS = 100
 """Number of gradient norms that the running median is taken of."""
-Self = TypeVar("Self", bound="APG")
 
 
 class APG(BaseAlgorithm):
@@ -55,13 +52,9 @@ class APG(BaseAlgorithm):
         env: GymEnv | str | None,
         learning_rate: float | Schedule = 4e-3,
         window: int = 180,
-        policy_kwargs: dict[str, Any] | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
         device: torch.device | str = "cpu",
         _init_setup_model: bool = True,
+        **options: Any,
     ) -> None:
         if isinstance(learning_rate, float):
             initial = learning_rate
@@ -69,18 +62,7 @@ class APG(BaseAlgorithm):
             def learning_rate(left: float) -> float:
                 return initial * left
 
-        super().__init__(
-            policy,
-            env,
-            learning_rate,
-            policy_kwargs,
-            stats_window_size,
-            tensorboard_log,
-            verbose,
-            device,
-            support_multi_env=True,
-            seed=seed,
-        )
+        super().__init__(policy, env, learning_rate, device=device, support_multi_env=True, **options)
         self.window = window
         self.norms = torch.zeros(NORMS)
         if _init_setup_model:
@@ -106,14 +88,9 @@ class APG(BaseAlgorithm):
         return config
 
     def learn(
-        self: Self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 10,
-        tb_log_name: str = "APG",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> Self:
+        self, total_timesteps: int, callback: MaybeCallback = None, log_interval: int = 10, tb_log_name: str = "APG",
+        reset_num_timesteps: bool = True, progress_bar: bool = False,
+    ) -> Self:  # fmt: skip
         """Learn for at least ``total_timesteps`` environment steps; see :meth:`stable_baselines3.PPO.learn`."""
         total_timesteps, watch = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
@@ -141,7 +118,7 @@ class APG(BaseAlgorithm):
         return self
 
     def _window(
-        self, crystals: _Crystals, memory: torch.Tensor, watch: BaseCallback
+        self, crystals: "_Crystals", memory: torch.Tensor, watch: BaseCallback
     ) -> tuple[torch.Tensor, torch.Tensor, bool]:
         """Drive every crystal through a window: its mean cost, differentiable, the memory, and whether to go on."""
         policy, going = self.policy, True

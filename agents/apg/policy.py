@@ -45,15 +45,9 @@ class RecurrentPolicy(BasePolicy):
     std: torch.Tensor
 
     def __init__(
-        self,
-        observation_space: Space[Any],
-        action_space: Space[Any],
-        lr_schedule: Schedule,
-        interval: float = 5.0,
-        units: int = 64,
-        hidden: int = 64,
-        betas: tuple[float, float] = (0.9, 0.9),
-    ) -> None:
+        self, observation_space: Space[Any], action_space: Space[Any], lr_schedule: Schedule, interval: float = 5.0,
+        units: int = 64, hidden: int = 64, betas: tuple[float, float] = (0.9, 0.9),
+    ) -> None:  # fmt: skip
         super().__init__(observation_space, action_space)
         self.options = {"interval": interval, "units": units, "hidden": hidden, "betas": betas}
         keep, gain, differences = leaky_means(interval)
@@ -96,11 +90,7 @@ class RecurrentPolicy(BasePolicy):
         self.std.copy_(torch.sqrt(self.std**2 + rate * (features.var(dim=0) - self.std**2)))
 
     def predict(
-        self,
-        observation: npt.NDArray[Any] | dict[str, npt.NDArray[Any]],
-        state: Any = None,
-        episode_start: npt.NDArray[Any] | None = None,
-        deterministic: bool = True,
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[npt.NDArray[Any], Any]:
         """The action within its box and the memory, as :meth:`stable_baselines3.PPO.predict`."""
         self.set_training_mode(False)

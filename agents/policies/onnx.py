@@ -1,10 +1,8 @@
 """A trained agent as data: an ONNX file run by onnxruntime, through the method ``predict``, without torch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +32,7 @@ class OnnxPolicy:
         return type(self).of, (self.contract, self.content)
 
     @classmethod
-    def load(cls, path: str | Path, config: Config | None = None) -> OnnxPolicy:
+    def load(cls, path: str | Path, config: Config | None = None) -> Self:
         """Load an agent file (.onnx with its .json beside it).
 
         With a config, the agent must have been trained on the same nominal plant. Raises AgentFileError, whose one line
@@ -49,7 +47,7 @@ class OnnxPolicy:
     @classmethod
     def of(
         cls, contract: Contract, onnx_bytes: bytes, config: Config | None = None, path: str | Path = "agent"
-    ) -> OnnxPolicy:
+    ) -> Self:
         """An agent from its contract and ONNX file; ``path`` names it in errors."""
         for name, known in ((contract.observation, OBSERVATIONS), (contract.action, ACTIONS)):
             if name not in known:

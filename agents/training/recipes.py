@@ -35,13 +35,9 @@ class Recipe:
     @property
     def config(self) -> Config:
         """The environment that the recipe's agents act in."""
-        interval = None if self.puller else self.control_interval
+        interval, puller = (None, self.puller) if self.puller else (self.control_interval, None)
         return make_config(
-            scenarios(self.scenario),
-            observation=self.observation,
-            control_interval=interval,
-            action=self.action,
-            puller=self.puller or None,
+            scenarios(self.scenario), None, self.observation, interval, action=self.action, puller=puller
         )
 
 

@@ -27,14 +27,9 @@ REFERENCES = ("paper", "paper-tuned", "lqg")
 References = Mapping[str, tuple[float, float]]
 """Mean RMSE of each reference [mm], on the crystals of PICKING and of JUDGING."""
 COLUMNS = (
-    "steps",
-    "seconds",
-    "validation_cost",
-    "validation_rmse_mm",
-    "pull_step_rms_mm_per_min",
-    "failure_rate",
+    "steps", "seconds", "validation_cost", "validation_rmse_mm", "pull_step_rms_mm_per_min", "failure_rate",
     *(f"{name}_rmse_mm" for name in REFERENCES),
-)
+)  # fmt: skip
 """Figures of a validation; those of the references are the same in every row."""
 
 

@@ -8,6 +8,7 @@ the reading at the puller's steady state minus r_0, is subtracted, as in the pla
 """
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -114,11 +115,8 @@ class RingDetector:
         if found.sum() < LEAST_LINES or contrast < LEAST_SHARE * self.contrast:
             return Ring(math.nan, edges)
         radii = edges[found] - self.shape[found]
-
-        def misses(radius: Floats) -> Floats:
-            return radii - radius
-
-        fit = least_squares(misses, [float(np.median(radii))], loss="soft_l1", f_scale=ROBUST, xtol=1e-12)
+        start = [float(np.median(radii))]
+        fit = least_squares(partial(np.subtract, radii), start, loss="soft_l1", f_scale=ROBUST, xtol=1e-12)
         return Ring(float(fit.x[0]) - self.bias, edges)
 
     def find_edges(self, image: npt.NDArray[np.uint8]) -> tuple[Floats, float]:

@@ -69,16 +69,13 @@ def camera_for(parameters: Parameters) -> Camera:
     )
 
 
-_AT_MOST_ONE = frozenset({"wall_emissivity", "shield_emissivity", "melt_emissivity", "crystal_emissivity"})
-
-
 def check_camera(camera: Camera, parameters: Parameters) -> Camera:
     """Return the camera, or raise CzError naming the parameter that is impossible at this puller."""
     if not isinstance(camera, Camera):
         raise CzError(f"camera must be a cz_gym.camera.Camera, not {camera!r}")
     check_numbers("camera parameter", camera)
     for name, value in camera._asdict().items():
-        if name in _AT_MOST_ONE and value > 1:
+        if name.endswith("_emissivity") and value > 1:
             raise CzError(f"camera parameter {name} = {value!r} must not exceed 1")
     if camera.tilt >= 0.5 * math.pi:
         raise CzError(f"camera parameter tilt = {camera.tilt!r} must be below pi / 2 [rad]: is it in degrees?")

@@ -1,13 +1,20 @@
 """What a virtual puller leaves on the disk, whole however its process ends: the log, and the state it goes on from."""
 
+import io
+import json
 import math
 import os
-import pickle
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.config import Identity
+from cz_gym.engine.batch import SlotState
+from cz_gym.env import EnvState
 from cz_gym.errors import CzError
 from cz_gym.machine.identify.table import COLUMNS
 from cz_gym.support.atomic_files import check_writable, naming, write_files
@@ -73,13 +80,25 @@ class Log:
         self._size += os.write(self._file, f"{line}\n".encode())
 
 
+class State(NamedTuple):
+    """A crystal and what its machine knows of it."""
+
+    env: EnvState
+    memory: npt.NDArray[np.float64]
+    """The fallback's memory, as :func:`flat` gives it."""
+    attributes: dict[str, Any]
+    """Attributes of the machine."""
+    tags: dict[str, Any]
+    """The newest tags."""
+
+
 class StateFile:
-    """The file of the newest state, from which a server that was killed goes on."""
+    """The file of the newest state, from which a server that was killed goes on: NumPy arrays and JSON, no code."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
 
-    def load(self) -> Any:
+    def load(self) -> State | None:
         """The state, or None if there is no file yet; CzError for a file of something else."""
         check_writable(self.path.absolute().parent)
         if not self.path.exists():
@@ -87,12 +106,34 @@ class StateFile:
         with naming(self.path):
             content = self.path.read_bytes()
         try:
-            return pickle.loads(content)
-        except Exception:  # a damaged pickle can raise anything
+            with np.load(io.BytesIO(content), allow_pickle=False) as file:
+                arrays = dict(file)
+            facts, memory = json.loads(arrays.pop("facts").item()), arrays.pop("memory")
+            identity: Any = (tuple(each) if isinstance(each, list) else each for each in facts["identity"])
+            slot = SlotState(Identity(*identity), scenario=facts["scenario"], **arrays)
+            return State(EnvState(slot, facts["random"]), memory, facts["attributes"], facts["tags"])
+        except Exception:  # a damaged file can raise anything
             raise CzError(f"{self.path}: no state of a virtual puller, or one of another version") from None
 
-    def save(self, state: Any) -> None:
+    def save(self, state: State) -> None:
         """Replace the file at once, without waiting for the disk."""
+        arrays = dict(vars(state.env.slot))
+        facts = {name: arrays.pop(name) for name in ("identity", "scenario")} | {"random": state.env.random}
+        facts |= {"attributes": state.attributes, "tags": state.tags}
         new = self.path.with_name(f".{self.path.name}.new")
-        new.write_bytes(pickle.dumps(state))
+        with open(new, "wb") as file:
+            np.savez(file, facts=np.array(json.dumps(facts)), memory=state.memory, **arrays)
         os.replace(new, self.path)
+
+
+def flat(memory: Any) -> npt.NDArray[np.float64]:
+    """The numbers of nested tuples of arrays, one after the other."""
+    return np.concatenate([flat(each) for each in memory]) if isinstance(memory, tuple) else np.ravel(memory)
+
+
+def unflat(numbers: Iterator[float], like: Any) -> Any:
+    """What :func:`flat` made these numbers of; ``like`` has the same tuples and shapes."""
+    if isinstance(like, tuple):
+        parts = [unflat(numbers, each) for each in like]
+        return type(like)(*parts) if hasattr(like, "_fields") else tuple(parts)
+    return np.array([next(numbers) for _ in range(np.size(like))]).reshape(np.shape(like))

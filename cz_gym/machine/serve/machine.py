@@ -20,7 +20,7 @@ from cz_gym.rendering.canvas import Frame
 from cz_gym.rendering.view import record_of
 from cz_gym.support.units import HOUR, KILO, MM_PER_MIN
 
-from .files import Log, StateFile
+from .files import Log, State, StateFile, flat, unflat
 
 SIZE = (640, 480)
 """Width and height of the picture [px]."""
@@ -74,8 +74,8 @@ TOLERANCE = 1e-6
 """Rounding in single precision that is forgiven at a setpoint's limits, relative [-]."""
 APPLIED = ("pull_speed_mm_per_min", "heater_power_kW")
 """Applied values of the drives, in the order of the setpoints."""
-SAVED = ("k", "answered", "manual", "_renewed", "_active", "_pending", "_memory")
-"""Attributes of a machine that its state holds beside the environment's."""
+SAVED = ("k", "answered", "manual", "_renewed", "_active", "_pending")
+"""Attributes of a machine that its state holds beside the environment's and the fallback's memory."""
 
 
 class Machine:
@@ -93,7 +93,7 @@ class Machine:
         self.env = CzEnv.from_config(config, "rgb_array", SIZE)
         self.interval, self.watchdog, self._ranges = config.control_interval, watchdog, config.ranges
         saved = state.load() if state else None
-        self._observation, _ = self.env.reset(seed=seed, options=saved and {"state": saved["env"]})
+        self._observation, _ = self.env.reset(seed=seed, options=saved and {"state": saved.env})
         self._record, self._log, self._state, self._lock = record_of(self.env), log, state, threading.RLock()
         self.puller = self._record.puller
         self._fallback = make_block(FALLBACK, config)
@@ -104,8 +104,8 @@ class Machine:
         self._fixed |= {"control_interval_s": self.interval, "watchdog_s": watchdog, "puller": config.puller.label}
         self._fixed["scenario"] = self._record.scenario
         self.k, self.answered, self.late, self.manual, self._renewed = 0, -1, False, False, -math.inf
-        self._active = self.nominal
-        self._pending = dict(zip(SETPOINTS, self.nominal.tolist(), strict=True))
+        self._active: list[float] = self.nominal.tolist()
+        self._pending = dict(zip(SETPOINTS, self._active, strict=True))
         self.committed = threading.Condition(self._lock)
         self.hour: deque[dict[str, Any]] = deque(maxlen=int(HOUR / self.interval) + 1)
         """The tags of the last hour."""
@@ -127,13 +127,16 @@ class Machine:
         spans = {name: (low[name], high[name]) for name in low if name != "valid"}
         return spans | limits | dict(zip(APPLIED, limits.values(), strict=True))
 
-    def _resume(self, saved: dict[str, Any]) -> None:
+    def _resume(self, saved: State) -> None:
         """Go on from a saved state."""
-        if saved["tags"]["alarms"] & Alarm.ENDED:
-            raise CzError(f"the crystal of this state has ended ({saved['tags']['state']}): name another file")
-        for name in SAVED:
-            setattr(self, name, saved[name])
-        self.hour.append(saved["tags"])
+        kinds = {name: type(value) for name, value in saved.tags.items()}
+        sound = kinds == {tag.name: tag.kind for tag in TAGS} and saved.memory.shape == flat(self._memory).shape
+        if not sound or set(saved.attributes) != set(SAVED):
+            raise CzError("this state was saved by another version of cz_gym, or damaged")
+        if saved.tags["alarms"] & Alarm.ENDED:
+            raise CzError(f"the crystal of this state has ended ({saved.tags['state']}): name another file")
+        vars(self).update(saved.attributes, _memory=unflat(iter(saved.memory), self._memory))
+        self.hour.append(saved.tags)
 
     def offer(self, writes: dict[str, Any]) -> dict[str, str]:
         """Take a client's values, all or none; returns the reasons of those that are refused.
@@ -175,7 +178,7 @@ class Machine:
 
     def _act(self) -> None:
         """Let the stored setpoints act."""
-        self._active, self._renewed = np.array([self._pending[name] for name in SETPOINTS]), self.k
+        self._active, self._renewed = [self._pending[name] for name in SETPOINTS], self.k
 
     @property
     def control(self) -> str:
@@ -198,19 +201,18 @@ class Machine:
             if control == "fallback":
                 given = before | {"ring_time_s": self.k * self.interval, "automatic": True}
                 outputs, self._memory = self._fallback.run(given, self._memory)
-                self._active = np.array([outputs[name][0] for name in SETPOINTS])
+                self._active = [float(outputs[name][0]) for name in SETPOINTS]
             else:
                 self._memory = self._fallback.start(1)
-            move = (self._active - self.nominal) / (self._ranges[0] / MM_PER_MIN, self._ranges[1] / KILO)
+            move = np.subtract(self._active, self.nominal) / (self._ranges[0] / MM_PER_MIN, self._ranges[1] / KILO)
             self._observation, *_ = self.env.step(move)
             self.k += 1
             tags = self._publish(control)
             if self._log is not None:
                 self._log.add(*([before] if self.k == 1 else []), tags)
             if self._state is not None:
-                self._state.save(
-                    {name: getattr(self, name) for name in SAVED} | {"env": self.env.get_state(), "tags": tags}
-                )
+                attributes = {name: getattr(self, name) for name in SAVED}
+                self._state.save(State(self.env.get_state(), flat(self._memory), attributes, tags))
             return tags
 
     def _publish(self, control: str = "held") -> dict[str, Any]:

@@ -34,12 +34,9 @@ TAKEN = {ua.VariantType.UInt32: WHOLE, ua.VariantType.Double: WHOLE | {ua.Varian
 KIND_OF = {tag.name: tag.kind for tag in TAGS}
 WRITABLE = {tag.name: KINDS[tag.kind] for tag in TAGS if tag.writable}
 UNITS = {
-    "_mm": ("mm", "MMT"),
-    "_mm_per_min": ("mm/min", "H81"),
-    "_K": ("K", "KEL"),
-    "_kW": ("kW", "KWT"),
+    "_mm": ("mm", "MMT"), "_mm_per_min": ("mm/min", "H81"), "_K": ("K", "KEL"), "_kW": ("kW", "KWT"),
     "_s": ("s", "SEC"),
-}
+}  # fmt: skip
 """Units by the endings of tags: name, and common code of UNECE Recommendation 20."""
 CODES = "http://www.opcfoundation.org/UA/units/un/cefact"
 MOST_CLIENTS = 100

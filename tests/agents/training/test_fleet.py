@@ -88,13 +88,7 @@ def test_an_unfinished_seed_goes_on_and_longer_runs_do_too(trained, tmp_path, mo
 
 
 @pytest.mark.parametrize("error", [AgentFileError("the training went wrong"), ValueError("could not be broadcast")])
-def test_one_seed_that_fails_stops_no_other(
-    error,
-    tmp_path,
-    monkeypatch,
-    trained,
-    capsys,
-):
+def test_one_seed_that_fails_stops_no_other(error, tmp_path, monkeypatch, trained, capsys):
     """An error that the project raises on purpose is one line; any other one is raised with its traceback."""
 
     def failing(job):

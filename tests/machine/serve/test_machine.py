@@ -1,6 +1,7 @@
 """The machine behind the tags: whose setpoints act, what is refused, and a clock that nothing delays."""
 
 import math
+import pickle
 import time
 
 import numpy as np
@@ -68,12 +69,12 @@ def test_a_crystal_goes_on_from_its_state_as_if_nothing_had_happened(tmp_path):
     whole = drive(machine(watchdog=30.0, horizon=1500.0), 300)
     log, file = tmp_path / "log.csv", StateFile(tmp_path / "state")
     first = machine(30.0, Log(log, 4096), file, horizon=1500.0)
-    drive(first, 170)
+    drive(first, 195)
     first._state = None
     drive(first, 1)
     second = machine(30.0, Log(log, 4096), file, horizon=1500.0)
-    assert second.k == 170
-    assert drive(second, 130) == whole[170:]
+    assert second.k == 195, "the fallback controls, and has a memory"
+    assert drive(second, 105) == whole[195:]
     parts = [log, *sorted(tmp_path.glob("log-?.csv"))]
     times = [np.genfromtxt(part, delimiter=",", names=True)["time_s"] for part in parts]
     assert np.concatenate(times).tolist() == [row["time_s"] for row in whole]
@@ -88,9 +89,16 @@ def test_a_state_of_other_settings_or_a_damaged_one_is_refused_in_one_line(tmp_p
     drive(machine(state=file, horizon=1500.0), 2)
     with pytest.raises(CzError, match=r"horizon 1500\.0, not 3000\.0"):
         machine(state=file, horizon=3000.0)
-    file.path.write_bytes(file.path.read_bytes()[:-100])
-    with pytest.raises(CzError, match="state: no state of a virtual puller"):
-        machine(state=file, horizon=1500.0)
+    whole, saved = file.path.read_bytes(), file.load()
+    halfway = len(whole) // 2
+    for damaged in (b"", whole[:-100], whole[:halfway] + b"CZOCHRALSKI" + whole[halfway + 11 :], pickle.dumps(print)):
+        file.path.write_bytes(damaged)
+        with pytest.raises(CzError, match="state: no state of a virtual puller"):
+            machine(state=file, horizon=1500.0)
+    for odd in ({"tags": {}}, {"memory": saved.memory[1:]}, {"attributes": {"step": None}}):
+        file.save(saved._replace(**odd))
+        with pytest.raises(CzError, match="another version of cz_gym, or damaged"):
+            machine(state=file, horizon=1500.0)
 
 
 def test_setpoints_that_are_not_renewed_are_held_and_then_the_fallback_takes_over_without_a_jump():
