@@ -38,12 +38,13 @@ SPARE = 1.03
 """What the search asks beyond them, because it looks at a grid of frequencies [-]."""
 CANDIDATES, FREQUENCIES = 500, 120
 MIDDLE = {
-    "heater.K_pull": 8.9, "heater.T_pull": 550.0, "heater.T_mean": 195.0, "heater.K": 590.0, "heater.T_i": 75.0,
+    "heater.K_pull": 8.9, "heater.T_pull": 550.0, "heater.T_mean": 195.0, "heater.K": 1000.0,
     "pid.T_i": 12_500.0, "pid.T_d": 560.0, "T_f": 5.5,
 }  # fmt: skip
 """Where the search begins, for the default puller: the best of 250 on 24 of its training crystals."""
-FIXED = {"heater.share": 1.0, "T_track": 3400.0, "T_start": 1500.0}
-"""What is outside the loop, chosen there too: without the whole recipe the ring would be off by its error."""
+FIXED = {"heater.share": 1.0, "heater.T_i": 1500.0, "T_track": 3400.0, "T_start": 1500.0}
+"""Chosen there too. Without the whole recipe the ring would be off by its error; with a faster heater the power that is
+held when the pyrometer goes is far from its mean, which loses crystals."""
 GAINS = np.geomspace(3e-4, 8e-3, 20)
 """Gains that it tries with all the rest, for the default puller [1/s]."""
 STEP, STEP_PRICE = 0.02 * MM_PER_MIN, 0.01
