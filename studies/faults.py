@@ -138,8 +138,8 @@ def report(rows: Mapping[tuple[str, str, str], Row], crystals: int) -> str:
     heads = "controller", "language", "fault", "RMSE [mm]", "of none", "lost", "alarms"
     return f"""# Blocks under the faults of a plant
 
-{crystals} test crystals of three hours each, errors from half an hour on, of those that were kept. In brackets: those of
-the lost that were lost while the drives stood still, when no block acts.
+{crystals} test crystals of three hours each, errors from half an hour on, of those that were kept. In brackets: those
+of the lost that were lost while the drives stood still, when no block acts.
 
 {markdown(heads, lines)}
 """
