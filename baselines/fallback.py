@@ -41,9 +41,9 @@ MIDDLE = {
     "heater.K_pull": 8.9, "heater.T_pull": 550.0, "heater.T_mean": 195.0, "heater.K": 1000.0,
     "pid.T_i": 12_500.0, "pid.T_d": 560.0, "T_f": 5.5,
 }  # fmt: skip
-"""Where the search begins, for the default puller: the best of 250 on 24 of its training crystals."""
+"""Where the search begins, for the default puller, from a search on 24 of its training crystals."""
 FIXED = {"heater.share": 1.0, "heater.T_i": 1500.0, "T_track": 3400.0, "T_start": 1500.0}
-"""Chosen there too. Without the whole recipe the ring would be off by its error; with a faster heater the power that is
+"""Chosen on training crystals too. Without the whole recipe the ring would be off by its error; with a faster heater the power that is
 held when the pyrometer goes is far from its mean, which loses crystals."""
 GAINS = np.geomspace(3e-4, 8e-3, 20)
 """Gains that it tries with all the rest, for the default puller [1/s]."""
