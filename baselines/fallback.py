@@ -43,8 +43,8 @@ MIDDLE = {
 }  # fmt: skip
 """Where the search begins, for the default puller, from a search on 24 of its training crystals."""
 FIXED = {"heater.share": 1.0, "heater.T_i": 1500.0, "T_track": 3400.0, "T_start": 1500.0}
-"""Chosen on training crystals too. Without the whole recipe the ring would be off by its error; with a faster heater the power that is
-held when the pyrometer goes is far from its mean, which loses crystals."""
+"""Chosen on training crystals too. Without the whole recipe the ring would be off by its error; with a faster heater
+the power that is held when the pyrometer goes is far from its mean, which loses crystals."""
 GAINS = np.geomspace(3e-4, 8e-3, 20)
 """Gains that it tries with all the rest, for the default puller [1/s]."""
 STEP, STEP_PRICE = 0.02 * MM_PER_MIN, 0.01
