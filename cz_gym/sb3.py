@@ -73,9 +73,7 @@ class CzVecEnv(VecEnv):
 
     def reset(self) -> Any:
         """Draw new episodes, with the seeds and options given before."""
-        seeds = list(self._seeds)
-        options = self._options[0] if self._options and self._options[0] else None
-        observation = self._shown(*self.env.reset(seed=seeds, options=options))
+        observation = self._shown(*self.env.reset(seed=list(self._seeds), options=(self._options or [{}])[0] or None))
         self._reset_seeds()
         self._reset_options()
         self._returns[:] = 0.0

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.config import make_config
-from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.machine.export.compiled import CompiledBlock
@@ -110,17 +110,21 @@ class Row(NamedTuple):
     rmse: float
     """From half an hour on, of the crystals that were kept [mm]."""
     lost: int
+    helpless: int
+    """How many of them were lost while the drives stood still."""
     alarms: Alarm
 
 
 def grow(block: Block, fault: str, crystals: int, runner: Runner | None = None, horizon: float = 3.0 * HOUR) -> Row:
-    """Grow validation crystals with a block, or what runs it, under the fault of that name."""
+    """Grow test crystals with a block, or what runs it, under the fault of that name."""
     interval = 0.5 * block.config.control_interval
     config = replace(block.config, control_interval=interval, horizon=horizon)
     faulty = Faulty(block, runner or block, FAULTS[fault])
-    run = rollout(BlockPolicy(block, faulty, interval), config, VALIDATION_SEEDS[:crystals])
+    run = rollout(BlockPolicy(block, faulty, interval), config, TEST_SEEDS[:crystals])
     error = (run.signals.r_c - run.signals.r_ref)[round(SETTLED / interval) :, ~run.failed] / MM
-    return Row(float(np.sqrt(np.mean(np.square(error)))), int(run.failed.sum()), Alarm(faulty.bits))
+    ends = run.alive.sum(axis=0)[run.failed] * interval
+    helpless = (ends > STILL[0]) & (ends <= STILL[1]) & FAULTS[fault].still
+    return Row(float(np.sqrt(np.mean(np.square(error)))), len(ends), int(helpless.sum()), Alarm(faulty.bits))
 
 
 def report(rows: Mapping[tuple[str, str, str], Row], crystals: int) -> str:
@@ -128,12 +132,14 @@ def report(rows: Mapping[tuple[str, str, str], Row], crystals: int) -> str:
     lines = []
     for (controller, language, fault), row in rows.items():
         share = row.rmse / rows[controller, language, "none"].rmse
+        lost = f"{row.lost} ({row.helpless})" if row.helpless else str(row.lost)
         names = ", ".join(bit.name or "" for bit in row.alarms)
-        lines.append((controller, language, fault, f"{row.rmse:.3f}", f"{share:.2f}", str(row.lost), names))
+        lines.append((controller, language, fault, f"{row.rmse:.3f}", f"{share:.2f}", lost, names))
     heads = "controller", "language", "fault", "RMSE [mm]", "of none", "lost", "alarms"
     return f"""# Blocks under the faults of a plant
 
-{crystals} validation crystals of three hours each, errors from half an hour on, of those that were kept.
+{crystals} test crystals of three hours each, errors from half an hour on, of those that were kept. In brackets: those
+of the lost that were lost while the drives stood still, when no block acts.
 
 {markdown(heads, lines)}
 """

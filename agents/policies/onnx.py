@@ -33,10 +33,9 @@ class OnnxPolicy:
 
     @classmethod
     def load(cls, path: str | Path, config: Config | None = None) -> Self:
-        """Load an agent file (.onnx with its .json beside it).
+        """Load an agent file (.onnx, with its .json beside it); nothing in it is executed but its tensor operations.
 
-        With a config, the agent must have been trained on the same nominal plant. Raises AgentFileError, whose one line
-        says why the file is refused. Nothing in the file is executed except its tensor operations.
+        With a config, it must have been trained on the same nominal plant. AgentFileError says why it is refused.
         """
         path = Path(path)
         if path.suffix != ".onnx":
@@ -143,8 +142,7 @@ def _session(path: str | Path, onnx_bytes: bytes, channels: int) -> tuple[Any, i
     except GraphError as error:
         raise AgentFileError(f"{path}: {error}") from None
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
     try:
         return onnxruntime.InferenceSession(clean, options, providers=["CPUExecutionProvider"]), state

@@ -44,17 +44,6 @@ def resize(driver, width):
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
 
 
-def check_width(driver, width):
-    """A window of this width [px] needs no sideways scrolling."""
-    resize(driver, width)
-    until(driver, lambda: driver.execute_script("return window.innerWidth") == width)
-    until(driver, lambda: driver.execute_script("return document.documentElement.scrollWidth <= window.innerWidth"))
-
-
-def check_log(driver):
-    assert [line for line in driver.get_log("browser") if line["level"] != "INFO"] == []
-
-
 def until(driver, holds):
     """What ``holds`` returns once it is true."""
     return WebDriverWait(driver, 60.0, 0.05).until(lambda _: holds())

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.browser.chromium import check_log, check_width, chromium, pytestmark, until  # noqa: F401
+from tests.browser.chromium import chromium, pytestmark, resize, until  # noqa: F401
 from tests.machine.serve.conftest import PASSWORD, running
 
 
@@ -62,10 +62,12 @@ def test_a_guest_cannot_set_drives_and_an_operator_can(puller, browser):
 
 @pytest.mark.parametrize("width", [1280, 400])
 def test_no_window_needs_sideways_scrolling(browser, width):
-    check_width(browser, width)
+    resize(browser, width)
+    until(browser, lambda: browser.execute_script("return window.innerWidth") == width)
+    until(browser, lambda: browser.execute_script("return document.documentElement.scrollWidth <= window.innerWidth"))
     image = browser.find_element("id", "crystal").rect
     assert image["width"] / image["height"] == pytest.approx(640 / 480, rel=0.01)
 
 
 def test_nothing_complains(browser):
-    check_log(browser)
+    assert [line for line in browser.get_log("browser") if line["level"] != "INFO"] == []

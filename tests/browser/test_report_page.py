@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cz_gym.evaluation.report.page import page
-from tests.browser.chromium import check_log, check_width, chromium, pytestmark, until  # noqa: F401
+from tests.browser.chromium import chromium, pytestmark, resize, until  # noqa: F401
 from tests.samples import result_of
 
 EVIL = "</script><img src=x onerror=document.title='evil'>\"'&amp;<b>%{x}<a href=\"javascript:alert(1)\">a</a>"
@@ -70,7 +70,9 @@ def test_the_first_line_is_the_verdict_and_names_are_text(browser):
 @pytest.mark.parametrize("width", [1280, 400])
 def test_no_window_needs_sideways_scrolling_and_nothing_covers_anything(browser, width):
     """Only a table may be wider than the window, inside its own frame."""
-    check_width(browser, width)
+    resize(browser, width)
+    until(browser, lambda: browser.execute_script("return window.innerWidth") == width)
+    until(browser, lambda: browser.execute_script("return document.documentElement.scrollWidth <= window.innerWidth"))
 
     def box(selector):
         script = "return document.querySelector(arguments[0]).getBoundingClientRect().toJSON()"
@@ -91,4 +93,4 @@ def test_no_window_needs_sideways_scrolling_and_nothing_covers_anything(browser,
 
 
 def test_the_browser_logged_no_error(browser):
-    check_log(browser)
+    assert [line for line in browser.get_log("browser") if line["level"] != "INFO"] == []

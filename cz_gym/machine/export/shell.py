@@ -89,13 +89,9 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
     off_Q_H = np.where(runs, memory.off_Q_H, _beyond(seen.read.Q_H, TRIM_Q_H * facts.ranges[1]))
     read = trimmed(seen.read, off_T_1, off_Q_H)
     nominal = drives[0].nominal, drives[1].nominal + off_Q_H / KILO
-    after = [(each.held - at) * unit for each, at, unit in zip(drives, nominal, (MM_PER_MIN, KILO), strict=True)]
-    later = call.later & runs
     between = memory.readings.ring_error + call.share * (read.ring_error - memory.readings.ring_error)
     read = read._replace(
         ring_error=np.where(runs & call.again, between, read.ring_error),
-        v_p=np.where(later, after[0], read.v_p),
-        Q_H=np.where(later, after[1], read.Q_H),
     )
     estimates = controller.accepts_missing_temperature
     shown = np.where(call.again, np.inf, seen.T_1 - off_T_1)
