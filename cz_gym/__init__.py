@@ -11,7 +11,7 @@ try:
     import gymnasium as gym
 except ModuleNotFoundError as error:
     said = f"{error.name} is missing: run .venv/bin/python, which `make venv` makes, or `pip install .`"
-    if sys.argv[0] == "-m":  # a command, as python -m cz_gym.play
+    if sys.argv[0] == "-m":  # a command, as cz-gym play
         sys.exit(said)
     raise ModuleNotFoundError(said, name=error.name) from None
 

@@ -1,4 +1,4 @@
-"""Datasets for offline learning, in Minari's format: ``python -m cz_gym.datasets`` (extra ``data``).
+"""Datasets for offline learning, in Minari's format: ``cz-gym data`` (extra ``data``).
 
 All policies are recorded in one form: "history" observations, "direct" actions, rewards, and as info the radius and the
 true state. Datasets of different policies can therefore be joined, and seed and actions reproduce an episode.
@@ -191,7 +191,7 @@ def write(
 def main(argv: list[str] | None = None) -> int:
     """Write datasets and print one line about each; 0 when done, 2 for bad input, 130 when interrupted."""
     about = "Write Minari datasets of policies on training crystals, with noise on their drives."
-    parser = OneLineParser("python -m cz_gym.datasets", about)
+    parser = OneLineParser("cz-gym data", about)
     add, policies = parser.add_argument, "paper,paper-tuned,lqg-at-0.02,gradient"
     add("--policies", default=policies, metavar="NAMES", help="controllers and shipped agents (%(default)s)")
     add("--scenarios", default="randomized,sensor-fault", metavar="NAMES", help="(%(default)s)")

@@ -1,6 +1,6 @@
 """A controller of a puller over OPC UA: any that ``cz_gym.machine.export`` can write, in Python or as compiled C.
 
-It reads the tags of ``python -m cz_gym.machine.serve``, calls the exported block, which has inputs of the same names,
+It reads the tags of ``cz-gym serve``, calls the exported block, which has inputs of the same names,
 and writes both setpoints and the step that they answer.
 """
 

@@ -31,8 +31,8 @@ PACKAGE = Path(__file__).parents[1]
 CACHE_VARIABLE = "CZ_GYM_CACHE_DIR"
 """Environment variable naming the folder for compiled code; empty means: keep none."""
 NEVER_COMPILED = (
-    "agents", "baselines", "commands", "datasets.py", "evaluation", "machine/export", "machine/pullers", "machine/serve", "play.py",
-    "rendering", "sb3.py", "support/command_line.py",
+    "agents", "baselines", "commands", "datasets.py", "evaluation", "machine/export", "machine/pullers",
+    "machine/serve", "play.py", "rendering", "sb3.py", "support/command_line.py",
 )  # fmt: skip
 """Parts of the package of which nothing is compiled in; all others count, whatever they hold."""
 FunctionCache: Any = caching.FunctionCache

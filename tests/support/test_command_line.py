@@ -25,7 +25,7 @@ COMMANDS = [
     (paper, "--ou", "report", ["--out", "new/folder"]),
     (tune, "--trial", "measure", ["--controller", "industrial", "--out", "new/folder"]),
     (speed, "--qui", "measure", ["--quick"]),
-    (play, "--minute", "settings", []),
+    (play, "--minute", "make_config", []),
     (datasets, "--episode", "record", ["--policies", "paper", "--out", "new/folder"]),
 ]
 """Each with the beginning of an option, the function that does its work, and arguments that would write a file."""
@@ -142,7 +142,18 @@ def test_only_what_is_meant_for_the_user_is_one_line_and_a_bug_keeps_its_traceba
 
 def test_every_package_of_the_extras_is_known_as_optional():
     project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
-    building = {"ruff", "mypy", "build", "setuptools", "pytest", "pytest_xdist", "hypothesis", "sybil", "scipy_stubs"}
+    building = {
+        "beautifulsoup4",
+        "ruff",
+        "mypy",
+        "build",
+        "setuptools",
+        "pytest",
+        "pytest_xdist",
+        "hypothesis",
+        "sybil",
+        "scipy_stubs",
+    }
     documenting = {"sphinx", "myst_parser", "furo", "latex2mathml", "jupytext"}
     optional = project["optional-dependencies"]
     needed = {re.split(r"[^\w-]", line)[0].replace("-", "_") for extra in optional.values() for line in extra}

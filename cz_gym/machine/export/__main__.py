@@ -1,4 +1,4 @@
-"""Write a controller for a plant, or the plant for a simulator: ``python -m cz_gym.machine.export``."""
+"""Write a controller for a plant, or the plant for a simulator: ``cz-gym export``."""
 
 import argparse
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ WRITERS: dict[str, Any] = {"c": write_c, "st": write_st, "onnx": write_onnx}
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the files; 0 when done, 2 for bad input."""
     parser = OneLineParser(
-        "python -m cz_gym.machine.export",
+        "cz-gym export",
         "Write a controller, with what a plant needs around it, as C99, structured text or ONNX; or the puller as FMU.",
     )
     add = parser.add_argument

@@ -1,6 +1,6 @@
 """Identification of a puller from its log: excitation, log reader, estimation, report.
 
-``python -m cz_gym.machine.identify LOG.csv --puller start.toml --out my.toml`` does it in one command.
+``cz-gym identify LOG.csv --puller start.toml --out my.toml`` does it in one command.
 """
 
 from .estimate import Identified, identify

@@ -1,4 +1,4 @@
-"""Identify a puller from its logs: ``python -m cz_gym.machine.identify LOG.csv --puller start.toml --out my.toml``."""
+"""Identify a puller from its logs: ``cz-gym identify LOG.csv --puller start.toml --out my.toml``."""
 
 import argparse
 import sys
@@ -20,7 +20,7 @@ NO_FIT = 3
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser("python -m cz_gym.machine.identify", "Identify a puller from its logs.")
+    parser = OneLineParser("cz-gym identify", "Identify a puller from its logs.")
     add = parser.add_argument
     add("log", type=Path, nargs="+", help=f"CSV or Parquet file of one machine, with the columns {', '.join(COLUMNS)}")
     add("--puller", default="default", help="puller file to start from (default: %(default)s)")

@@ -1,2 +1,2 @@
 """A virtual puller: the environment behind an OPC UA server, with an operator's page:
-``python -m cz_gym.machine.serve``."""
+``cz-gym serve``."""

@@ -1,4 +1,4 @@
-"""``python -m cz_gym.machine.serve``: a virtual puller on OPC UA, with an operator's page."""
+"""``cz-gym serve``: a virtual puller on OPC UA, with an operator's page."""
 
 import argparse
 import asyncio
@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def commands() -> OneLineParser:
     """The parser of the command line."""
     parser = OneLineParser(
-        "python -m cz_gym.machine.serve",
+        "cz-gym serve",
         "A virtual puller: an OPC UA server with one crystal behind it, and an operator's page.",
         "Passwords are read from CZ_GYM_OPERATOR_PASSWORD and CZ_GYM_READER_PASSWORD. Ctrl-C ends.",
     )
