@@ -45,7 +45,7 @@ class LQGDesign:
     is lost (nested saturation, Teel 1992)."""
 
 
-PUZZLING = 0.7
+PUZZLING = 1.0
 """Mean of the ring's innovations over ten minutes, in standard deviations, that no good model has; of the pyrometer's,
 which may also stick or drift, twice as much [-]."""
 

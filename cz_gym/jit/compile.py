@@ -6,10 +6,13 @@ the outermost function, so a changed equation in another module would run the ol
 named by a hash of every source of the package that can be compiled in.
 """
 
+import hashlib
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from inspect import signature
 from typing import Any, TypeVar, cast
+from uuid import uuid4
 
 import numba
 import numpy as np
@@ -127,12 +130,31 @@ def _compiled_fetch(array: Any, at: Any) -> Any:
     return compiled
 
 
+@cache
+def _symbol(value: Any) -> str:
+    """A name of a static value's functions for symbols: stable for those of this package, else used once.
+
+    Machine code of two values that is loaded from disk into one process must not have symbols in common: the linker
+    would take one for the other.
+    """
+    text = repr([_function_name(part) for part in value])
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _function_name(part: Any) -> Any:
+    if isinstance(part, tuple):
+        return [_function_name(each) for each in part]
+    name = f"{getattr(part, '__module__', '')}.{getattr(part, '__qualname__', part)}"
+    ours = name.startswith("cz_gym.") and "<" not in name
+    return name if ours or not callable(part) else f"{name} {uuid4()}"
+
+
 class Static(types.Opaque):
     """Type of one :func:`static` value: its attributes are constants and functions of the compiled code."""
 
     def __init__(self, value: Any) -> None:
         self.value = value
-        super().__init__(f"Static({type(value).__name__})")
+        super().__init__(f"Static({type(value).__name__}, {_symbol(value)})")
 
     @property
     def key(self) -> Any:

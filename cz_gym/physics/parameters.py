@@ -17,7 +17,7 @@ class Parameters(NamedTuple):
 
     Nominal temperatures, power, meniscus height and heat fluxes are *derived* from these by
     :func:`cz_gym.body.plant.make_puller`. Another puller or material is another instance:
-    ``Parameters(r_0=0.1)`` or ``Parameters()._replace(sigma=0.83)``. :func:`describe` has each one's unit, meaning,
+    ``Parameters(r_0=0.1)`` or ``Parameters()._replace(sigma=0.83)``. ``describe`` has each one's unit, meaning,
     source and range.
     """
 

@@ -156,3 +156,27 @@ def test_a_users_meniscus_is_never_run_from_a_cache():
         isinstance(build_kernels(BODY, one).step._cache, CachedCode) for one in (HURLE, HURLE._replace(height=height))
     ]
     assert kept == [True, False]
+
+
+TWO_MENISCI = """
+import sys
+import gymnasium as gym
+import numpy as np
+from cz_gym import HURLE, make_puller
+from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+for name in sys.argv[1:]:
+    meniscus = {"hurle": HURLE, "exact": YOUNG_LAPLACE}[name]
+    env = gym.make("cz_gym:Cz-v0", scenario="nominal", model="I", meniscus=meniscus, info="all")
+    env.reset(seed=0)
+    for _ in range(20):
+        info = env.step(np.zeros(2, np.float32))[4]
+    assert abs(info["r_c"] - make_puller(meniscus=meniscus).r_0) < 1e-12, name
+"""
+
+
+@pytest.mark.slow
+def test_code_of_two_menisci_that_two_processes_compiled_does_not_mix(tmp_path, monkeypatch):
+    """Symbols had the same names: the linker took one meniscus for the other, and a crystal at rest grew."""
+    monkeypatch.setenv("CZ_GYM_CACHE_DIR", str(tmp_path))
+    for names in (["hurle"], ["exact"], ["hurle", "exact"], ["exact", "hurle"]):
+        python("-c", TWO_MENISCI, *names)
