@@ -3,11 +3,12 @@
 import hashlib
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from numbers import Integral, Real
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 from cz_gym.body.process import BODY
 from cz_gym.camera.view import Camera, camera_for, check_camera
@@ -49,6 +50,8 @@ class Identity(NamedTuple):
     """[s]."""
     puller: str = DEFAULT.label
     """Name and hash of the puller file."""
+    weights: str = ""
+    """Weights of the reward's terms."""
 
     def difference(self, other: Self) -> str | None:
         """The first difference in words; None if there is none."""
@@ -80,6 +83,8 @@ class Config:
     """The machine; scenario, parameters and control interval follow from it in :func:`make_config`."""
     process: Process = field(default=BODY, repr=False)
     """What is simulated."""
+    weights: Any = BODY.weights
+    """Weights of the reward's terms (:class:`cz_gym.body.cost.Weights`)."""
 
     @property
     def ranges(self) -> tuple[float, float]:
@@ -119,6 +124,13 @@ class Config:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
+    def reward_hash(self) -> str:
+        """SHA-256 of the reward: code of its terms, and their weights (16 hex digits)."""
+        process = self.process
+        text = f"{function_hash(process.charged, process.carry, process.cost_terms, process.reward)} {self.weights}"
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    @property
     def made_for(self) -> MadeFor:
         """What controllers and agents of this environment are made for."""
         return MadeFor(self.action, self.control_interval, self.plant_hash, self.puller.label)
@@ -138,6 +150,7 @@ class Config:
         return Identity(
             *(VERSION, self.plant_hash, scenario, mix, seen, self.action, self.control_interval, self.horizon),
             self.puller.label,
+            ", ".join(f"{name} {weight:g}" for name, weight in self.weights._asdict().items()),
         )
 
     def with_scenario(self, scenario: AnyScenario) -> Self:
@@ -166,6 +179,7 @@ def make_config(
     action: str = "smooth",
     puller: str | Path | PullerFile | None = None,
     process: Process | None = None,
+    weights: Mapping[str, float] | None = None,
 ) -> Config:
     """Check the arguments of the environment; CzError names what was given and what is allowed."""
     machine, process = find_puller(puller), process or BODY
@@ -192,7 +206,19 @@ def make_config(
         *(drawn_from, model, observation, action, interval, length, checked, meniscus or HURLE, checked_camera),
         puller=machine,
         process=process,
+        weights=_weights(weights or {}, process.weights),
     )
+
+
+def _weights(given: Any, usual: Any) -> Any:
+    """The usual weights with the given ones in their place."""
+    named = given._asdict() if hasattr(given, "_asdict") else dict(needs(Mapping, given, "weights={'pull': 0.1}"))
+    for name, weight in named.items():
+        if name not in usual._fields:
+            raise CzError(unknown("weight", name, usual._fields))
+        if not isinstance(weight, Real) or not 0.0 <= weight < math.inf:
+            raise CzError(f"the weight {name!r} must be a number of at least 0, not {weight!r}")
+    return usual._replace(**{name: float(weight) for name, weight in named.items()})
 
 
 @lru_cache(maxsize=64)

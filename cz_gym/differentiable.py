@@ -30,9 +30,9 @@ class Step(NamedTuple):
     """The result of a step, one row per slot, and its derivatives."""
 
     state: Floats
-    """The numbers of :data:`STATES`, SI units, shape (n, 9)."""
+    """The numbers of :data:`STATES`, SI units, shape (n, 10)."""
     measured: npt.NDArray[np.float32]
-    """The "measured" observation, shape (n, 11)."""
+    """The "measured" observation, shape (n, 12)."""
     cost: Floats
     """The four terms of the cost (:class:`cz_gym.body.cost.Cost`), shape (n, 4)."""
     error: Floats
@@ -43,13 +43,13 @@ class Step(NamedTuple):
     """Whether the crystal grew, shape (n,). One that is lost or whose episode is over stays as it is; its cost and its
     derivatives are 0."""
     jacobian: Floats
-    """Derivatives of the next state and of the cost's terms, shape (n, 13, 11): rows are state and cost, columns the
+    """Derivatives of the next state and of the cost's terms, shape (n, 14, 12): rows are state and cost, columns the
     state before and the two actions."""
 
 
 STATES = smooth(BODY)
-"""The differentiable state: radius, meniscus height [m], T_1, T_2, T_b [K], v_p [m/s], Q_H [W], the bright ring [m] and
-the camera's reading of it [m]. All else that a step depends on (disturbances, noise, time) depends on no action."""
+"""The differentiable state: radius, meniscus height [m], T_1, T_2, T_b [K], v_p [m/s], Q_H [W], the
+mean of v_p [m/s], the bright ring [m] and the camera's reading of it [m]. All else that a step depends on (disturbances, noise, time) depends on no action."""
 
 
 class DifferentiableBatch:
@@ -59,7 +59,8 @@ class DifferentiableBatch:
     5 s for which disturbances are held, and its camera's latency must not be longer than the control interval.
 
     Noise, freezes and drop-outs are those of the environment; a held reading depends on the state at which it was
-    taken. The derivatives ignore that the heater moves in whole steps and that observations are rounded.
+    taken. The derivatives ignore that the heater moves in whole steps and that observations are rounded; where a
+    scenario has a heater's lag or a pyrometer's filter, they are those of a machine without either.
     """
 
     def __init__(self, config: Config, num_envs: int, threads: int | None = 1) -> None:
@@ -73,11 +74,8 @@ class DifferentiableBatch:
                 f"the camera's latency of {latency:g} s is longer than the control interval; a puller file's latency_s "
                 "stands in place of the scenario's"
             )
-        machines = [(each.actuators, each.sensor) for each in config.scenario.scenarios]
-        if any(max(a.heater_lag + a.heater_dead_time + s.pyrometer_filter) > 0.0 for a, s in machines):
-            raise CzError(
-                "a slow heater or a pyrometer's filter has no derivatives: lag, dead time and filter must be 0"
-            )
+        if any(max(each.actuators.heater_dead_time) > 0.0 for each in config.scenario.scenarios):
+            raise CzError("a heater with a dead time has no derivatives: heater_dead_time must be 0")
         self.config = config = replace(config, observation="measured")
         self._made_for = config.made_for
         self._batch = Batch(config, self.num_envs, threads)
@@ -85,19 +83,19 @@ class DifferentiableBatch:
         self._out = self._batch.new_out()
         self._names, info = smooth(config.process), config.process.info
         self._state = np.zeros((num_envs, len(self._names)))
-        self._costs = [info.index(f"cost_{name}") for name in config.process.Cost._fields]
+        self._costs = [info.index(f"term_{name}") for name in config.process.Cost._fields]
         self._errors = [info.index(name) for name in (*config.process.Lean._fields[:2], "ring_offset")]
         self.grows, self._begun = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
         """Whether each crystal grew in the last step, and whether each slot has one, shape (n,)."""
         self._work = np.zeros(work_shape(config.process))
         self._jacobians = BufferPool((self.num_envs, len(rows(config.process)), len(self._names) + ACTIONS), np.float64)
         self.measured_by_state = _measured_by_state(config)
-        """Derivatives of the "measured" observation with respect to the state, shape (11, 9)."""
+        """Derivatives of the "measured" observation with respect to the state, shape (12, 10)."""
 
     def reset(self, seeds: Sequence[int], which: Sequence[int] | None = None) -> tuple[Floats, npt.NDArray[np.float32]]:
         """Draw the episodes of these seeds, one for each of the slots ``which``, by default all; the others stay.
 
-        Returns state, shape (n, 9), and "measured" observation, shape (n, 11), of all slots. ValueError unless each
+        Returns state, shape (n, 10), and "measured" observation, shape (n, 12), of all slots. ValueError unless each
         seed is a whole number and each slot there is named once at most.
         """
         slots = list(range(self.num_envs) if which is None else which)
@@ -168,7 +166,7 @@ class DifferentiableBatch:
 
 
 def _measured_by_state(config: Config) -> Floats:
-    """Derivatives of "measured" with respect to the differentiable state, shape (11, 9)."""
+    """Derivatives of "measured" with respect to the differentiable state, shape (12, 10)."""
     channels, names = config.process.measured, smooth(config.process)
     by_state, shown = np.zeros((len(channels), len(names))), scales(channels, *config.ranges)
     for row, channel in enumerate(channels):

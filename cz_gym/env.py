@@ -122,16 +122,18 @@ class CzEnv(Form, gym.Env[Observation, Action]):
     ``info["action_clipped"]`` says so; NaN or a wrong shape raises :class:`gymnasium.error.InvalidAction`.
 
     ## Observation Space
-    ``Box(-10, 10, (n,), float32)``; every channel with unit and scale in :mod:`cz_gym.observation`. "measured" (11) is
-    what a puller's control computer has. "history" (72), the default, tells the same relative to reference and recipe,
+    ``Box(-10, 10, (n,), float32)``; every channel with unit and scale in :mod:`cz_gym.observation`. "measured" (12) is
+    what a puller's control computer has. "history" (73), the default, tells the same relative to reference and recipe,
     with the integral of the error and differences of past means: what a learner without memory of its own needs.
-    "state" (17) is the true state and the disturbances, for bounds only. "camera" is the camera's image instead,
+    "state" (18) is the true state and the disturbances, for bounds only. "camera" is the camera's image instead,
     ``Box(0, 255, (120, 160, 1), uint8)``; see :mod:`cz_gym.camera`.
 
     ## Rewards
-    1 - c with c = 10 cost / (10 + cost), cost = (e_r / 0.5 mm)^2 + 0.5 (dv / 0.36 mm/min)^2 + 0.05 (step of v_p /
+    1 - c with c = 10 cost / (10 + cost), cost = (e_r / 0.5 mm)^2 + 0.5 (dv / 0.03)^2 + 0.05 (step of v_p /
     0.06 mm/min)^2 + 0.5 (step of Q_H / 1 kW)^2; e_r is the true radius error, less the ring's offset that no sensor
-    shows, and dv the part of |v_p - v_0| beyond 0.24 mm/min. The step at which the crystal is lost earns 1,000 less.
+    shows, and dv the part of the relative deviation of the 30 min mean of v_p from v_0 beyond 3 %. The step at which
+    the crystal is lost earns 1,000 less. ``info["cost"]`` is 1 in a step with |r_c - r_ref| > 0.5 mm or that mean
+    beyond 3 %, else 0: the cost of constrained reinforcement learning.
 
     ## Starting State
     The drawn puller's own operating point, the radius off by N(0, 0.2 mm) on "randomized".
@@ -144,12 +146,13 @@ class CzEnv(Form, gym.Env[Observation, Action]):
     ``scenario`` (name, :class:`cz_gym.Scenario`, a dict of several with their shares of the episodes, or "all"; of
     several, ``info["scenario"]`` names the episode's own), ``model`` ("I", "II", a mix in [0, 1], or None for the
     scenario's draw), ``observation``, ``action`` ("direct", "smooth" or "rate"), ``control_interval`` [s],
-    ``horizon`` [s], ``info`` ("lean": true radius and its reference; "all": every signal, see
+    ``horizon`` [s], ``info`` ("lean": true radius, its reference and ``cost``; "all": every signal, see
     :class:`cz_gym.body.signals.Logged`; with observation "history" also the true ``state``, for critics),
     ``render_mode``, ``parameters`` (:class:`cz_gym.Parameters`), ``meniscus`` (:class:`cz_gym.MeniscusModel`),
     ``camera`` (:class:`cz_gym.camera.Camera`, with observation "camera" only), ``puller`` (a file, or the name of a
     shipped one; see docs/extend/puller.md: parameters and control interval are then its own), ``process`` (what is
-    simulated, :class:`cz_gym.process.Process`). Bad values raise ValueError.
+    simulated, :class:`cz_gym.process.Process`), ``weights`` (those of the reward's terms that are not the usual ones,
+    ``{"pull": 0.1}``; :class:`cz_gym.body.cost.Weights`). Bad values raise ValueError.
     ``render_mode`` is None, "rgb_array" or "human", ``render_size`` the picture's width and height [px]; rendering
     needs the extra ``render``, without which no mode is declared and asking for one raises
     :class:`gymnasium.error.DependencyNotInstalled`.
@@ -174,6 +177,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         info: str = "lean",
         puller: str | Path | PullerFile | None = None,
         process: Process | None = None,
+        weights: Mapping[str, float] | None = None,
         **others: Any,
     ) -> None:
         known_keywords(others, type(self).__init__)
@@ -189,6 +193,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
             action,
             puller,
             process,
+            weights,
         )
         self._setup(config, render_mode, render_size, info)
 

@@ -124,7 +124,7 @@ class Process(NamedTuple):
     """Channels of "state"."""
     Logged: Any
     """Rows of ``info``; among them those of ``Lean``, ``v_p``, ``Q_H``, ``ring_offset``, ``action_clipped``, and
-    ``cost_`` with each name of ``Cost``."""
+    ``term_`` with each name of ``Cost``."""
     Lean: Any
     """Rows of ``info="lean"``: the controlled quantity and its reference first."""
     Cost: Any
@@ -166,13 +166,15 @@ class Process(NamedTuple):
     """``charged(x, u, before, extra, slot, t)``: ``Cost`` of the numbers that the terms charge, ``before`` the inputs
     of the step before."""
     cost_terms: Function
-    """``cost_terms(*charged)``: ``Cost``."""
+    """``cost_terms(charged, weights)``: ``Cost``."""
     cost_slopes: Function
-    """``cost_slopes(*charged)``: the derivative of each term by its own number."""
+    """``cost_slopes(charged, weights)``: the derivative of each term by its own number."""
     reward: Function
     """``reward(cost, grows)``: the reward of a step [-], whose cost is ``Cost``; false if the crystal is lost in it."""
     equations: tuple[Any, ...]
     """The functions that define the plant, for :attr:`cz_gym.config.Config.plant_hash`."""
+    weights: Any
+    """The usual weights of the cost's terms, a named tuple of numbers."""
     Extra: Any = NoExtra
     """Numbers of a slot that outlive a step."""
     carry: Function = carry_nothing

@@ -29,13 +29,14 @@ def design_rates(x: np.ndarray, u: Truth, p: Any) -> np.ndarray:
     v_g = (p.Phi_s - Phi_l) / p.rho_dH
     link = p.kappa_12 * (T_1**4 - T_2**4)
     wall = p.G_2b * (T_2 - T_b)
+    kappa_b = p.emission * (p.R_cr**2 - r_c**2)
     return np.array(
         [
             v_g * np.tan(alpha_c),
             u.v_p - v_g,
             (u.Q_H - link - p.G_1a * (T_1 - p.T_a)) / p.C_1,
             (link - wall) / p.C_2,
-            (wall - p.kappa_b * (T_b**4 - p.T_e**4) - p.Q_i + u.Q_d) / (p.C_b * u.melt),
+            (wall - kappa_b * (T_b**4 - p.T_e**4) - np.pi * r_c**2 * Phi_l + u.Q_d) / (p.C_b * u.melt),
         ]
     )
 

@@ -17,7 +17,7 @@ from cz_gym.observation import CLIP, OBSERVATIONS
 from cz_gym.support.atomic_files import write_files
 
 FORMAT = "cz-gym-agent"
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 MAX_BYTES = 4_000_000
 """Largest agent file that is read."""
 MAX_JSON_BYTES = 1_000_000
@@ -48,6 +48,8 @@ class Contract:
     """Time between its actions [s]."""
     plant_hash: str
     """Hash of the nominal plant it was trained on."""
+    reward_hash: str
+    """Hash of the reward that it was trained and validated with (:attr:`cz_gym.config.Config.reward_hash`)."""
     scenario: str
     """Scenario, or shares of scenarios, that it was trained on."""
     scenario_hash: str
@@ -84,6 +86,7 @@ def facts_of(config: Config) -> dict[str, Any]:
         "action": config.action,
         "control_interval": config.control_interval,
         "plant_hash": config.plant_hash,
+        "reward_hash": config.reward_hash,
         "scenario": config.scenario.name,
         "scenario_hash": config.scenario.hash,
         "puller": config.puller.label,

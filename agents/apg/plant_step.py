@@ -5,15 +5,15 @@ from typing import Any
 import torch
 
 from cz_gym.action import drives_of
-from cz_gym.body.cost import cost_terms, saturated
+from cz_gym.body.cost import Cost, cost_terms, saturated
 from cz_gym.config import Config
 from cz_gym.differentiable import STATES, DifferentiableBatch
 
-R_C, V_P, Q_H = (STATES.index(name) for name in ("r_c", "v_p", "Q_H"))
+R_C, V_P, Q_H, V_P_MEAN = (STATES.index(name) for name in ("r_c", "v_p", "Q_H", "v_p_mean"))
 
 
 def advance(state: torch.Tensor, action: torch.Tensor, batch: DifferentiableBatch) -> Any:
-    """State (n, 9) and "measured" (n, 11) after an action (n, 2), whether each crystal grew, and its target.
+    """State (n, 10) and "measured" (n, 12) after an action (n, 2), whether each crystal grew, and its target.
 
     ``state`` is the batch's present one; gradients go back through it to the step before. The target (n,) is the radius
     at which sensors would show no error [m]: the reference less the bright ring's offset, which no sensor shows.
@@ -46,6 +46,7 @@ class StepCost:
     """
 
     def __init__(self, config: Config) -> None:
+        self.weights = config.weights
         self.drives, self.v_0 = drives_of(config.action, config.control_interval), config.parameters.v_0
 
     def __call__(
@@ -54,5 +55,5 @@ class StepCost:
         """The saturated sum of the four terms, shape (n,), from the states before and after; 0 if it does not grow."""
         asked = (self.drives.keep - 1.0) * (before[:, V_P] - self.v_0) + self.drives.pull * self.v_0 * action[:, 0]
         error, heater_step = after[:, R_C] - target, after[:, Q_H] - before[:, Q_H]
-        terms = cost_terms(error, after[:, V_P] - self.v_0, asked, heater_step)
+        terms = cost_terms(Cost(error, after[:, V_P_MEAN] / self.v_0 - 1.0, asked, heater_step), self.weights)
         return torch.where(grows, saturated(sum(terms)), 0.0)

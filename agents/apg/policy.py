@@ -70,12 +70,12 @@ class RecurrentPolicy(BasePolicy):
         return torch.zeros(n, MEANS + self.gru.hidden_size)
 
     def remember(self, measured: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Features, shape (n, features), and leaky means after a reading of shape (n, 11)."""
+        """Features, shape (n, features), and leaky means after a reading of shape (n, 12)."""
         means = memory[:, :MEANS] * self.keep + measured @ self.gain
         return torch.cat([measured, means], dim=1) @ self.differences, means
 
     def forward(self, measured: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """The action, shape (n, 2), unclipped, and the memory after a reading of shape (n, 11)."""
+        """The action, shape (n, 2), unclipped, and the memory after a reading of shape (n, 12)."""
         features, means = self.remember(measured, memory)
         x = torch.clamp((features - self.mean) / self.std.clamp(*STD_RANGE), -FEATURE_LIMIT, FEATURE_LIMIT)
         h = self.gru(x, memory[:, MEANS:])
@@ -116,7 +116,7 @@ class RecurrentPolicy(BasePolicy):
 def leaky_means(interval: float) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
     """The share of the means kept per step, what a reading adds, and the features as differences of both.
 
-    ``interval`` is the time between readings [s]; shapes (MEANS,), (11, MEANS), (11 + MEANS, features). The past enters
+    ``interval`` is the time between readings [s]; shapes (MEANS,), (12, MEANS), (12 + MEANS, features). The past enters
     as differences of successive means, since raw means differ by micrometres under millimetres.
     """
     share = 1.0 - np.exp(-interval / np.array(TIMES))
@@ -130,7 +130,7 @@ def leaky_means(interval: float) -> tuple[npt.NDArray[Any], npt.NDArray[Any], np
         gain[names.index(name), own] = share
         chain = [now[name], *rows[len(names) :][own]]
         features += [later - earlier for later, earlier in pairwise(chain)] + chain[-1:]
-    features += [now["valid"], now["r_ref"], now["T_1_ref"] - now["T_1"]]
+    features += [now["v_p_mean"], now["valid"], now["r_ref"], now["T_1_ref"] - now["T_1"]]
     for name in ("r_ref", "T_1_ref"):
         features += [now[f"{name}_{ahead}"] - now[name] for ahead in ("1min", "5min")]
     return np.tile(1.0 - share, len(AVERAGED)), gain, np.stack(features, axis=1)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats
-from cz_gym.body.cost import beyond_band, coefficients
+from cz_gym.body.cost import PULL_MEMORY, beyond_band, coefficients
 from cz_gym.body.plant import Inputs, State
 from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.episodes.scenario import Actuators
@@ -22,6 +22,8 @@ from .future import Future
 STATES, INPUTS = len(State._fields), len(Inputs._fields)
 SCALES = np.array([MM, MM, 1.0, 1.0, 1.0, MM_PER_MIN, KILO])
 """Units [m, m, K, K, K, m/s, W] in which state and inputs are of the same order."""
+MEAN = STATES + INPUTS
+"""Place of the mean pull speed in the state of a stage, after the plant's state and the held inputs."""
 TOLERANCE = 1e-7
 """Largest last move, in SCALES, of a converged optimum."""
 MOST_STEPS = 200
@@ -138,8 +140,8 @@ def optimise(future: Future, limits: Limits) -> Trajectory:
         stages = _stages(future, x, u, nominal, slack, force, barrier)
         feedback, forward = sweep_back(stages)
         after, moves = sweep_forward(stages, feedback, forward)
-        dz = after * SCALES
-        held = after[:, :, STATES:]
+        dz = after[:, :, :MEAN] * SCALES
+        held = after[:, :, STATES:MEAN]
         ds = np.stack([-held, held, -moves, moves])
         df = barrier / slack - force - force / slack * ds
         fraction = np.minimum(_step_fraction(slack, ds), _height_fraction(x[1:, :, 1], dz[:, :, 1], future))
@@ -148,7 +150,7 @@ def optimise(future: Future, limits: Limits) -> Trajectory:
         slack = _slacks(u, nominal, limits)
         force = force + _step_fraction(force, df)[:, None] * df
         moved = np.abs(after).max(axis=(0, 2))
-    return Trajectory(x, u, feedback * (SCALES[STATES:, None] / SCALES), moved)
+    return Trajectory(x, u, feedback[..., :MEAN] * (SCALES[STATES:, None] / SCALES), moved)
 
 
 def linearised(future: Future, x: Floats, u: Floats) -> tuple[Floats, Floats]:
@@ -168,37 +170,45 @@ def linearised(future: Future, x: Floats, u: Floats) -> tuple[Floats, Floats]:
 
 _BLOCK = 128
 """Number of steps that are linearised together: they fit a processor's cache."""
-_PER_SQUARE = np.array(coefficients()) * np.array([MM, MM_PER_MIN, MM_PER_MIN, KILO]) ** 2
-"""Cost terms of one unit of :data:`SCALES`; that of the pull speed beyond its band."""
-_CURVATURE = 2.0 * np.array([_PER_SQUARE[0], 0.0, 0.0, 0.0, 0.0, _PER_SQUARE[1], 0.0])
-_MOVE_CURVATURE = 2.0 * _PER_SQUARE[2:]
+_CURVATURE = 2.0 * np.array(coefficients()) * np.array([MM, 1.0, MM_PER_MIN, KILO]) ** 2
+"""Second derivatives of the cost's terms by one unit of :data:`SCALES`, or by the relative mean pull speed."""
+_MOVE_CURVATURE = _CURVATURE[2:]
+
+
+def mean_pull(v_p: Floats, v_0: Floats, interval: float) -> Floats:
+    """The mean pull speed after each step, relative to v_0 [-]; v_p [m/s] has shape (N, n), v_0 shape (n,)."""
+    share, relative = -np.expm1(-interval / PULL_MEMORY), v_p / v_0 - 1.0
+    means, mean = np.empty_like(relative), np.zeros(len(v_0))
+    for k, now in enumerate(relative):
+        mean = means[k] = mean + share * (now - mean)
+    return means
 
 
 def _stages(
     future: Future, x: Floats, u: Floats, nominal: Floats, slack: Floats, force: Floats, barrier: float
 ) -> Stages:
-    """The problem of a Newton step in deviations from (x, u); its states are x and the held inputs."""
+    """The problem of a Newton step in deviations from (x, u); its states are x, the held inputs and the mean pull."""
     after, slopes = linearised(future, x, u)
     N, n = future.target.shape
     slopes = slopes * (SCALES / SCALES[:STATES, None])
-    A = np.zeros((N, n, STATES + INPUTS, STATES + INPUTS))
-    A[:, :, :STATES] = slopes
-    A[:, :, STATES:, STATES:] = np.eye(INPUTS)
-    c = np.zeros((N, n, STATES + INPUTS))
+    share, v_0 = -math.expm1(-float(future.lengths[:, 0].sum()) / PULL_MEMORY), nominal[:, 0] / SCALES[STATES]
+    A = np.zeros((N, n, MEAN + 1, MEAN + 1))
+    A[:, :, :STATES, :MEAN] = slopes
+    A[:, :, STATES:MEAN, STATES:MEAN] = np.eye(INPUTS)
+    A[:, :, MEAN, MEAN], A[:, :, MEAN, STATES] = 1.0 - share, share / v_0
+    c = np.zeros((N, n, MEAN + 1))
     c[:, :, :STATES] = (after - x[1:]) / SCALES[:STATES]
     moves = np.diff(u, axis=0, prepend=nominal[None]) / SCALES[STATES:]
     upper, lower, up, down = range(4)
     curvature, slope = force / slack, barrier / slack
-    Q, q = np.broadcast_to(_CURVATURE, c.shape).copy(), np.zeros(c.shape)
-    held = u - nominal
-    held[:, :, 0] = beyond_band(held[:, :, 0])
-    Q[:, :, STATES] *= held[:, :, 0] != 0.0
-    Q[:, :, STATES:] += curvature[upper] + curvature[lower]
-    q[:, :, 0] = _CURVATURE[0] * (x[1:, :, 0] - future.target) / MM
-    q[:, :, STATES:] = _CURVATURE[STATES:] * held / SCALES[STATES:] + slope[upper] - slope[lower]
+    Q, q = np.zeros(c.shape), np.zeros(c.shape)
+    beyond = beyond_band(mean_pull(u[:, :, 0], nominal[:, 0], float(future.lengths[:, 0].sum())))
+    Q[:, :, 0], q[:, :, 0] = _CURVATURE[0], _CURVATURE[0] * (x[1:, :, 0] - future.target) / MM
+    Q[:, :, STATES:MEAN], q[:, :, STATES:MEAN] = curvature[upper] + curvature[lower], slope[upper] - slope[lower]
+    Q[:, :, MEAN], q[:, :, MEAN] = _CURVATURE[1] * (beyond != 0.0), _CURVATURE[1] * beyond
     R = _MOVE_CURVATURE + curvature[up] + curvature[down]
     r = _MOVE_CURVATURE * moves + slope[up] - slope[down]
-    return Stages(A, A[:, :, :, STATES:], c, Q, q, R, r)
+    return Stages(A, A[:, :, :, STATES:MEAN], c, Q, q, R, r)
 
 
 def _slacks(u: Floats, nominal: Floats, limits: Limits) -> Floats:

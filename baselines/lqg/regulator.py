@@ -13,9 +13,13 @@ from scipy.linalg import solve_discrete_are
 from cz_gym.baselines.policy import Floats
 from cz_gym.body.cost import Weights, coefficients
 from cz_gym.observation import PREVIEWS, Measured
+from cz_gym.support.units import MM_PER_MIN
 
 from .model import DRIFT, PLANT, STATES, PlantModel
 
+PULL_SCALE = 0.36 * MM_PER_MIN
+"""Deviation of the pull speed at which its quadratic term equals its weight [m/s]; the reward charges its mean, beyond
+a band."""
 STEP_TIME = 5.0
 """Control interval [s] of the weights on moves; at other intervals the continuous-time law stays the same."""
 
@@ -39,11 +43,11 @@ class Regulator(NamedTuple):
 def quadratic_cost(weights: Weights, dt: float) -> tuple[Floats, Floats, Floats]:
     """Q, N and R of the cost sum z' Q z + 2 z' N du + du' R du, z = (plant's states, previous inputs), for dt [s]."""
     Q, N = np.zeros((PLANT + 2, PLANT + 2)), np.zeros((PLANT + 2, 2))
-    per_square = coefficients(weights)
+    per_square, pull = coefficients(weights), weights.pull / PULL_SCALE**2
     per_step = (STEP_TIME / dt) ** 2
     Q[0, 0] = per_square.radius
-    Q[PLANT, PLANT] = N[PLANT, 0] = per_square.pull
-    R = np.diag([per_square.pull + per_step * per_square.pull_step, per_step * per_square.heater_step])
+    Q[PLANT, PLANT] = N[PLANT, 0] = pull
+    R = np.diag([pull + per_step * per_square.pull_step, per_step * per_square.heater_step])
     return Q, N, R
 
 

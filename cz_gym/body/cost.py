@@ -6,8 +6,10 @@ controller's cost is its radius error; ``python -m studies.frontier`` shows how 
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from cz_gym.jit.compile import jittable
-from cz_gym.support.units import KILO, MM, MM_PER_MIN
+from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
 
 class Cost(NamedTuple):
@@ -16,7 +18,7 @@ class Cost(NamedTuple):
     radius: Any
     """Error of the true radius, less the offset of the bright ring that no sensor shows."""
     pull: Any
-    """Deviation of the pull speed from v_0, beyond :data:`PULL_BAND`."""
+    """Deviation of the mean pull speed from v_0, beyond :data:`PULL_TOLERANCE`: it spoils the crystal (v/G)."""
     pull_step: Any
     """Change of the pull speed from the last step to this one."""
     heater_step: Any
@@ -32,11 +34,14 @@ class Weights(NamedTuple):
     heater_step: float = 0.5
 
 
-SCALES = Cost(0.5 * MM, 0.36 * MM_PER_MIN, 0.06 * MM_PER_MIN, 1.0 * KILO)
-"""The deviations [m, m/s, m/s, W] at which a term equals its weight."""
-PULL_BAND = 0.24 * MM_PER_MIN
-"""Deviation of the pull speed that costs nothing, a fifth of v_0 [m/s]: good controllers rarely leave this band; a
-learner that does is led back before the pull speed meets the limits of its drive."""
+TOLERANCE = 0.5 * MM
+"""Half width of the radius' tolerance band [m]."""
+PULL_TOLERANCE = 0.03
+"""Deviation of the mean pull speed that costs nothing, relative to v_0 [-]."""
+PULL_MEMORY = 30.0 * MINUTE
+"""Averaging time of that mean, which is exponential [s]."""
+SCALES = Cost(TOLERANCE, PULL_TOLERANCE, 0.06 * MM_PER_MIN, 1.0 * KILO)
+"""The deviations [m, -, m/s, W] at which a term equals its weight; of the mean pull speed, those beyond its band."""
 WEIGHTS = Weights()
 """The weights of the environment's reward."""
 COST_CAP = 10.0
@@ -46,32 +51,47 @@ FAILURE_COST = 1000.0
 
 
 @jittable
-def beyond_band(pull: Any) -> Any:
-    """The part of a pull speed's deviation that lies beyond :data:`PULL_BAND`, with its sign [m/s]."""
-    return (pull - PULL_BAND) * (pull.real > PULL_BAND) + (pull + PULL_BAND) * (pull.real < -PULL_BAND)
+def moved_mean(mean: Any, v_p: Any, interval: Any) -> Any:
+    """The mean pull speed [m/s] after an interval [s] at v_p [m/s]."""
+    return mean + (1.0 - np.exp(-interval / PULL_MEMORY)) * (v_p - mean)
 
 
 @jittable
-def cost_terms(radius_error: Any, pull: Any, pull_step: Any, heater_step: Any, weights: Any = WEIGHTS) -> Any:
-    """The weighted terms [-]; arguments: radius error [m], v_p - v_0 [m/s], steps of v_p [m/s] and of Q_H [W]."""
-    return Cost(
-        weights.radius * (radius_error / SCALES.radius) ** 2,
-        weights.pull * (beyond_band(pull) / SCALES.pull) ** 2,
-        weights.pull_step * (pull_step / SCALES.pull_step) ** 2,
-        weights.heater_step * (heater_step / SCALES.heater_step) ** 2,
+def beyond_band(pull: Any) -> Any:
+    """The part of a relative deviation that lies beyond :data:`PULL_TOLERANCE`, with its sign [-]."""
+    return (pull - PULL_TOLERANCE) * (pull.real > PULL_TOLERANCE) + (pull + PULL_TOLERANCE) * (
+        pull.real < -PULL_TOLERANCE
     )
 
 
 @jittable
-def cost_slopes(radius_error: Any, pull: Any, pull_step: Any, heater_step: Any, weights: Any = WEIGHTS) -> Any:
-    """The derivative of each of :func:`cost_terms` by its own argument."""
+def cost_terms(at: Any, weights: Any = WEIGHTS) -> Any:
+    """The weighted terms [-] at a radius error [m], a relative deviation of the mean pull speed [-] and steps of both
+    drives [m/s, W]."""
+    return Cost(
+        weights.radius * (at.radius / SCALES.radius) ** 2,
+        weights.pull * (beyond_band(at.pull) / SCALES.pull) ** 2,
+        weights.pull_step * (at.pull_step / SCALES.pull_step) ** 2,
+        weights.heater_step * (at.heater_step / SCALES.heater_step) ** 2,
+    )
+
+
+@jittable
+def cost_slopes(at: Any, weights: Any = WEIGHTS) -> Any:
+    """The derivative of each of :func:`cost_terms` by its own number."""
     per_square = coefficients(weights)
     return Cost(
-        2.0 * per_square.radius * radius_error,
-        2.0 * per_square.pull * beyond_band(pull),
-        2.0 * per_square.pull_step * pull_step,
-        2.0 * per_square.heater_step * heater_step,
+        2.0 * per_square.radius * at.radius,
+        2.0 * per_square.pull * beyond_band(at.pull),
+        2.0 * per_square.pull_step * at.pull_step,
+        2.0 * per_square.heater_step * at.heater_step,
     )
+
+
+@jittable
+def outside(radius_error: Any, pull: Any) -> Any:
+    """1 where a crystal leaves its quality: true radius error [m] or mean pull speed, relative [-], out of tolerance."""
+    return 1.0 * ((np.abs(radius_error) > TOLERANCE) | (np.abs(pull) > PULL_TOLERANCE))
 
 
 @jittable

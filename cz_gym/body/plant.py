@@ -2,8 +2,8 @@
 
 Everything here is a pure function of labelled tuples in SI units, kelvin and radians. ``p`` is a
 :class:`Puller`, or a NumPy record with the same field names (what the compiled loop holds per slot); fields
-may be floats, arrays or complex numbers. The thermal chain drives growth one way: the interface's heat draw
-Q_i stays at its nominal value, whatever the crystal does.
+may be floats, arrays or complex numbers. Heat flows both ways between melt and crystal: the interface takes
+pi r_c^2 Phi_l from the melt, and the crystal covers a part of the surface that radiates.
 """
 
 import math
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym.engine.arithmetic import rk4 as runge_kutta
 from cz_gym.episodes.schedule import drift, melt_left
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import force_inlined, jittable
@@ -53,6 +54,8 @@ class Growth(NamedTuple):
     """Growth rate [m/s]."""
     tan_alpha: Any
     """Tangent of the cone angle alpha_c = theta - alpha_0 [-]."""
+    Phi_l: Any
+    """Heat flux from the melt into the interface [W/m2]."""
 
 
 class Puller(NamedTuple):
@@ -88,8 +91,10 @@ class Puller(NamedTuple):
     """Ambient temperature [K]."""
     G_2b: float
     """Conductance of the quartz wall [W/K]."""
-    kappa_b: float
-    """Radiation of the melt surface, eps sigma_SB pi (R_cr^2 - r_0^2) [W/K4]."""
+    emission: float
+    """Radiation of a melt surface of one square metre times pi, pi eps sigma_SB [W/m2/K4]."""
+    R_cr: float
+    """Radius of the crucible [m]."""
     T_e: float
     """Temperature the melt surface sees [K]."""
     r_0: float
@@ -100,8 +105,6 @@ class Puller(NamedTuple):
     """Nominal meniscus height, where alpha_c = 0 [m]."""
     Phi_s: float
     """Heat flux into the crystal [W/m2]."""
-    Q_i: float
-    """Heat the interface draws from the melt, pi r_0^2 Phi_l0 [W]."""
     T_1_0: float
     """Nominal heater temperature [K]."""
     T_2_0: float
@@ -138,16 +141,16 @@ class _RingPuller(NamedTuple):
 
 @jittable
 def derive_puller(q: Any, lam: Any, height: Any, ring_offset: Any) -> Any:
-    """Solve the operating point in order: h_0, Phi_l0, Phi_s, Q_i, T_2, T_1, Q_H0, ring bias."""
+    """Solve the operating point in order: h_0, Phi_l0, Phi_s, Q_i0, T_2, T_1, Q_H0, ring bias."""
     a = np.sqrt(2.0 * q.sigma / (q.rho_l * q.g))
     h_0 = height(q.r_0, q.alpha_0, a)
     Phi_l_0 = q.k_l * q.dT_0 / h_0
     rho_dH = q.rho_s * q.dH
     Phi_s = Phi_l_0 + rho_dH * q.v_0
-    Q_i = math.pi * q.r_0 * q.r_0 * Phi_l_0
-    kappa_b = q.eps * q.sigma_SB * math.pi * (q.R_cr * q.R_cr - q.r_0 * q.r_0)
+    emission = math.pi * q.eps * q.sigma_SB
     T_b_0 = q.T_m + q.dT_0
-    through = kappa_b * (T_b_0**4 - q.T_e**4) + Q_i
+    surface = emission * (q.R_cr * q.R_cr - q.r_0 * q.r_0) * (T_b_0**4 - q.T_e**4)
+    through = surface + math.pi * q.r_0 * q.r_0 * Phi_l_0
     T_2_0 = T_b_0 + through / q.G_2b
     T_1_0 = np.sqrt(np.sqrt(T_2_0**4 + through / q.kappa_12))
     Q_H_0 = through + q.G_1a * (T_1_0 - q.T_a)
@@ -156,8 +159,8 @@ def derive_puller(q: Any, lam: Any, height: Any, ring_offset: Any) -> Any:
     return Puller(
         lam=lam, a=a, sin_alpha_0=ring.sin_alpha_0, cos_alpha_0=ring.cos_alpha_0, X_b=ring.X_b,
         k_l=q.k_l, rho_dH=rho_dH, T_m=q.T_m, C_1=q.C_1, C_2=q.C_2, C_b=q.C_b,
-        kappa_12=q.kappa_12, G_1a=q.G_1a, T_a=q.T_a, G_2b=q.G_2b, kappa_b=kappa_b, T_e=q.T_e,
-        r_0=q.r_0, v_0=q.v_0, h_0=h_0, Phi_s=Phi_s, Q_i=Q_i,
+        kappa_12=q.kappa_12, G_1a=q.G_1a, T_a=q.T_a, G_2b=q.G_2b, emission=emission, R_cr=q.R_cr, T_e=q.T_e,
+        r_0=q.r_0, v_0=q.v_0, h_0=h_0, Phi_s=Phi_s,
         T_1_0=T_1_0, T_2_0=T_2_0, T_b_0=T_b_0, Q_H_0=Q_H_0, ring_bias=bias,
     )  # fmt: skip
 
@@ -193,7 +196,7 @@ def growth(x: Any, d: Any, p: Any, slope: Any) -> Any:
     sin_theta, cos_theta = slope(x.r_c, x.h_c, p)
     sin_alpha = sin_theta * p.cos_alpha_0 - cos_theta * p.sin_alpha_0
     cos_alpha = cos_theta * p.cos_alpha_0 + sin_theta * p.sin_alpha_0
-    return Growth(v_g, sin_alpha / cos_alpha)
+    return Growth(v_g, sin_alpha / cos_alpha, Phi_l)
 
 
 @jittable
@@ -209,30 +212,22 @@ def rates(x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
     at_interface = growth(x, d, p, slope)
     radiated = p.kappa_12 * (fourth_power(x.T_1) - fourth_power(x.T_2))
     into_melt = p.G_2b * (x.T_2 - x.T_b)
-    surface_loss = p.kappa_b * (fourth_power(x.T_b) - fourth_power(p.T_e))
+    crystal = x.r_c * x.r_c
+    surface_loss = p.emission * (p.R_cr * p.R_cr - crystal) * (fourth_power(x.T_b) - fourth_power(p.T_e))
+    into_crystal = math.pi * crystal * at_interface.Phi_l
     return State(
         at_interface.v_g * at_interface.tan_alpha,
         u.v_p - at_interface.v_g,
         (u.Q_H - radiated - p.G_1a * (x.T_1 - p.T_a)) / p.C_1,
         (radiated - into_melt) / p.C_2,
-        (into_melt - surface_loss - p.Q_i + d.Q_d) / (p.C_b * d.melt),
+        (into_melt - surface_loss - into_crystal + d.Q_d) / (p.C_b * d.melt),
     )
-
-
-@jittable
-def along(x: Any, s: Any, k: Any) -> Any:
-    """The state x + s k."""
-    return State(x.r_c + s * k.r_c, x.h_c + s * k.h_c, x.T_1 + s * k.T_1, x.T_2 + s * k.T_2, x.T_b + s * k.T_b)
 
 
 @force_inlined
 def rk4(x: Any, u: Any, d: Any, p: Any, dt: Any, slope: Any) -> Any:
     """One classical Runge-Kutta step of dt [s], inputs and disturbance held."""
-    k_1 = rates(x, u, d, p, slope)
-    k_2 = rates(along(x, 0.5 * dt, k_1), u, d, p, slope)
-    k_3 = rates(along(x, 0.5 * dt, k_2), u, d, p, slope)
-    k_4 = rates(along(x, dt, k_3), u, d, p, slope)
-    return along(along(along(along(x, dt / 6.0, k_1), dt / 3.0, k_2), dt / 3.0, k_3), dt / 6.0, k_4)
+    return runge_kutta(rates, x, u, d, p, dt, slope)
 
 
 @jittable

@@ -1,6 +1,6 @@
 """The process of ``Cz-v0``: plant, signals, task and cost of a crystal's body as one value for the engine."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,13 @@ _LOW = 5.0 * MM
 _JUMP = HEIGHT_MIN
 
 
+class Extra(NamedTuple):
+    """Numbers besides the state that outlive a step."""
+
+    v_p_mean: Any
+    """Exponential mean of the applied pull speed over :data:`cz_gym.body.cost.PULL_MEMORY` [m/s]."""
+
+
 def check(parameters: Parameters, meniscus: MeniscusModel) -> Parameters:
     """Return the parameters; raise CzError unless a crystal can grow with them."""
     checked = check_parameters(parameters)
@@ -38,6 +45,7 @@ def derive(parameters: Any, factors: Any, m: Any) -> Any:
 def begin(slot: Any, m: Any) -> Any:
     """The operating point's state, the radius off by what was drawn."""
     p = slot.puller
+    slot.v_p_mean = p.v_0
     return State(p.r_0 + slot.episode.r_c_start, p.h_0, p.T_1_0, p.T_2_0, p.T_b_0)
 
 
@@ -113,16 +121,22 @@ def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, m: Any) -> An
 
 @jittable
 def lean(slot: Any, measured: Any) -> Any:
-    """True radius and its reference."""
-    return signals.Lean(slot.x.r_c, slot.puller.r_0 + measured.r_ref)
+    """True radius, its reference, and whether the crystal is out of tolerance."""
+    return signals.Lean(slot.x.r_c, slot.puller.r_0 + measured.r_ref, signals.out_of_tolerance(slot, measured))
+
+
+@jittable
+def carry(extra: Any, u: Any, p: Any, interval: Any) -> Any:
+    """The mean pull speed after an interval."""
+    return Extra(cost.moved_mean(extra.v_p_mean, u.v_p, interval))
 
 
 @jittable
 def charged(x: Any, u: Any, before: Any, extra: Any, slot: Any, t: Any) -> Any:
-    """True radius error less what no sensor shows [m], pull speed above nominal [m/s], steps of both drives."""
+    """True radius error less what no sensor shows [m], mean pull speed above nominal [-], steps of both drives."""
     p, e = slot.puller, slot.episode
     error = x.r_c - p.r_0 - reference(t, e) + bias_offset(t, e)
-    return cost.Cost(error, u.v_p - p.v_0, u.v_p - before.v_p, u.Q_H - before.Q_H)
+    return cost.Cost(error, extra.v_p_mean / p.v_0 - 1.0, u.v_p - before.v_p, u.Q_H - before.Q_H)
 
 
 BODY = Process(
@@ -154,4 +168,7 @@ BODY = Process(
     cost_slopes=cost.cost_slopes,
     reward=cost.reward,
     equations=plant.EQUATIONS,
+    weights=cost.WEIGHTS,
+    Extra=Extra,
+    carry=carry,
 )

@@ -15,6 +15,8 @@ from cz_gym.process import HEATER_SCALE, PULL_SCALE, Past, Relative, signals
 from cz_gym.process import Channel as Channel
 from cz_gym.support.units import KILO, MINUTE, MM
 
+from .cost import outside
+
 PREVIEWS = (0.0, 1.0 * MINUTE, 5.0 * MINUTE)
 """Times ahead for which reference and recipe are observed [s]."""
 _IN_1_MIN, _IN_5_MIN = PREVIEWS[1:]
@@ -41,6 +43,7 @@ class Measured(NamedTuple):
     T_1: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "pyrometer reading minus nominal")]
     v_p: Annotated[Any, Channel("m/s", PULL_SCALE, "applied pull speed minus v_0; the scale is v_0")]
     Q_H: Annotated[Any, Channel("W", HEATER_SCALE, "applied heater power minus nominal")]
+    v_p_mean: Annotated[Any, Channel("m/s", 0.05 * PULL_SCALE, "exponential 30 min mean of v_p; the scale is v_0 / 20")]
 
 
 @jittable
@@ -60,6 +63,7 @@ def measure(slot: Any, t: Any) -> Any:
         T_1=slot.T_1 - p.T_1_0,
         v_p=slot.v_p - p.v_0,
         Q_H=slot.Q_H - p.Q_H_0,
+        v_p_mean=slot.v_p_mean - p.v_0,
     )
 
 
@@ -82,6 +86,7 @@ class TrueState(NamedTuple):
     T_1_ref_5min: Annotated[Any, _SHARED["T_1_ref_5min"]]
     v_p: Annotated[Any, _SHARED["v_p"]]
     Q_H: Annotated[Any, _SHARED["Q_H"]]
+    v_p_mean: Annotated[Any, _SHARED["v_p_mean"]]
     dT_i: Annotated[Any, Channel("K", 1.0, "interface fluctuation now")]
     Q_d: Annotated[Any, Channel("W", KILO, "heat load on the melt now")]
     ring_offset: Annotated[Any, Channel("m", MM, "offset of the ring that no sensor shows")]
@@ -106,6 +111,7 @@ def true_state(slot: Any, measured: Any, t: Any) -> Any:
         T_1_ref_5min=measured.T_1_ref_5min,
         v_p=measured.v_p,
         Q_H=measured.Q_H,
+        v_p_mean=measured.v_p_mean,
         dT_i=slot.dT_i,
         Q_d=slot.Q_d,
         ring_offset=bias_offset(t, slot.episode),
@@ -124,16 +130,27 @@ class Logged(NamedTuple):
     v_g: Annotated[Any, Channel("m/s", 1.0, "growth rate")]
     v_p: Annotated[Any, Channel("m/s", 1.0, "applied pull speed")]
     Q_H: Annotated[Any, Channel("W", 1.0, "applied heater power")]
+    v_p_mean: Annotated[Any, Channel("m/s", 1.0, "exponential 30 min mean of the applied pull speed")]
     T_1: Annotated[Any, Channel("K", 1.0, "true heater temperature")]
     T_1_ref: Annotated[Any, Channel("K", 1.0, "recipe of the heater temperature")]
     T_b: Annotated[Any, Channel("K", 1.0, "true melt temperature")]
     r_br_measured: Annotated[Any, Channel("m", 1.0, "the camera's reading, with noise and offset")]
     ring_offset: Annotated[Any, Channel("m", 1.0, "offset of the ring that no sensor shows")]
-    cost_radius: Annotated[Any, Channel("1", 1.0, "the cost's term of the radius error")]
-    cost_pull: Annotated[Any, Channel("1", 1.0, "the cost's term of the pull speed")]
-    cost_pull_step: Annotated[Any, Channel("1", 1.0, "the cost's term of the step of the pull speed")]
-    cost_heater_step: Annotated[Any, Channel("1", 1.0, "the cost's term of the step of the heater power")]
+    term_radius: Annotated[Any, Channel("1", 1.0, "the reward's term of the radius error")]
+    term_pull: Annotated[Any, Channel("1", 1.0, "the reward's term of the mean pull speed")]
+    term_pull_step: Annotated[Any, Channel("1", 1.0, "the reward's term of the step of the pull speed")]
+    term_heater_step: Annotated[Any, Channel("1", 1.0, "the reward's term of the step of the heater power")]
+    cost: Annotated[
+        Any, Channel("1", 1.0, "1 if |r_c - r_ref| > 0.5 mm or v_p_mean is off v_0 by more than 3 %, else 0")
+    ]
     action_clipped: Annotated[Any, Channel("bool", 1.0, "whether the action lay outside its box")]
+
+
+@jittable
+def out_of_tolerance(slot: Any, measured: Any) -> Any:
+    """The constraint's cost of a step: 1 if the crystal leaves its quality, else 0."""
+    error = slot.x.r_c - slot.puller.r_0 - measured.r_ref
+    return outside(error, slot.v_p_mean / slot.puller.v_0 - 1.0)
 
 
 @jittable
@@ -149,15 +166,17 @@ def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, at_interface:
         v_g=at_interface.v_g,
         v_p=slot.v_p,
         Q_H=slot.Q_H,
+        v_p_mean=slot.v_p_mean,
         T_1=x.T_1,
         T_1_ref=p.T_1_0 + measured.T_1_ref,
         T_b=x.T_b,
         r_br_measured=slot.ring + p.ring_bias,
         ring_offset=bias_offset(t, slot.episode),
-        cost_radius=cost.radius,
-        cost_pull=cost.pull,
-        cost_pull_step=cost.pull_step,
-        cost_heater_step=cost.heater_step,
+        term_radius=cost.radius,
+        term_pull=cost.pull,
+        term_pull_step=cost.pull_step,
+        term_heater_step=cost.heater_step,
+        cost=out_of_tolerance(slot, measured),
         action_clipped=slot.clipped,
     )
 
@@ -167,6 +186,7 @@ class Lean(NamedTuple):
 
     r_c: Any
     r_ref: Any
+    cost: Any
 
 
 PAST = (

@@ -78,7 +78,7 @@ class Batch:
         process = config.process
         self.kernels = build_kernels(process, config.meniscus)
         points = math.ceil(config.horizon / GRID) + 1
-        self.clock = Clock(config.control_interval, config.steps, points, config.radius_limit)
+        self.clock = Clock(config.control_interval, config.steps, points, config.radius_limit, config.weights)
         self.drives = drives_of(config.action, config.control_interval, *config.ranges[::-1])
         self.channels = len(observations(process)["history" if config.observation == "history" else "measured"])
         shows_state = config.observation == "state" or (everything and config.observation == "history")

@@ -62,7 +62,8 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, 
     if out.state.shape[1] > 0:
         write_channels(process.true_state(slot, measured, t), scales.state, out.state[i])
     u, before = labelled(Inputs, slot), Inputs(slot.v_p_before, slot.Q_H_before)
-    cost = process.cost_terms(*process.charged(x, u, before, labelled(process.Extra, slot), slot, t))
+    charged = process.charged(x, u, before, labelled(process.Extra, slot), slot, t)
+    cost = process.cost_terms(charged, clock.weights)
     if slot.k == 0:
         cost = along(cost, -1.0, cost)
     if scales.everything:

@@ -131,6 +131,8 @@ class Clock(NamedTuple):
     """Points of the 5 s grid in an episode."""
     radius_limit: float
     """Largest |r_c - r_ref| [m]."""
+    weights: Any
+    """Weights of the cost's terms, a named tuple."""
 
 
 class Memory(NamedTuple):

@@ -163,14 +163,14 @@ def _carried_by(J: Any, slot: Any, extra: Any, interval: Any, model: Any) -> Non
 
 
 @jittable
-def _cost_by(J: Any, slot: Any, t: Any, model: Any) -> None:
+def _cost_by(J: Any, slot: Any, t: Any, weights: Any, model: Any) -> None:
     """Derivatives of the cost's terms, from those of the next state."""
     process, n, by = model.process, model.states, scratch(model.costs, model.charged_by)
     at = (
         labelled(process.State, slot.x), labelled(Inputs, slot), Inputs(slot.v_p_before, slot.Q_H_before),
         labelled(process.Extra, slot),
     )  # fmt: skip
-    slopes = process.cost_slopes(*derivatives(process.Cost, process.charged, at, (slot, t), by))
+    slopes = process.cost_slopes(derivatives(process.Cost, process.charged, at, (slot, t), by), weights)
     for term in range(model.costs):
         row = J[model.smooth + term]
         for i in range(model.charged_by - 2):
@@ -248,7 +248,7 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, Any]
                 if seen_by[0, row] != 0.0:
                     for j in range(model.columns):
                         J[ring, j] += seen_by[0, row] * J[row, j]
-            _cost_by(J, slot, slot.k * dt, model)
+            _cost_by(J, slot, slot.k * dt, clock.weights, model)
             # The camera's frame is of now, of the grid point inside the step, or of the sample before.
             fresh, between = slot.k_seen == slot.k, inside and at <= slot.k * dt - e.latency + _EPS
             for j in range(model.columns):

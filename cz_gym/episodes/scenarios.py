@@ -104,6 +104,8 @@ HOT_ZONE = replace(
         melt_capacity_factor=(0.7, 1.4),
         conductance_factor=(0.75, 1.33),
     ),
+    sensor=replace(RANDOMIZED.sensor, pyrometer_filter=(0.0, 20.0)),
+    actuators=replace(RANDOMIZED.actuators, heater_lag=(0.0, 10.0)),
 )
 
 _ONE_FAMILY = (

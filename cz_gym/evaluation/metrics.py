@@ -6,17 +6,14 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.body.cost import PULL_TOLERANCE, TOLERANCE
 from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .rollout import Rollout
 
 Floats = npt.NDArray[np.float64]
-TOLERANCE = 0.5 * MM
-"""Half width of the tolerance band [m]."""
 PULL_WINDOW = 30.0 * MINUTE
 """Length of the running mean of the pull speed, on which v/G depends [s]."""
-PULL_TOLERANCE = 0.03
-"""Largest deviation of that mean from the nominal pull speed, relative [-]."""
 
 ALMOST = 1.0 - 1e-6
 """Share of a limit that counts as the limit itself [-]."""
@@ -75,7 +72,8 @@ def metrics(run: Rollout) -> Metrics:
     error, observable = radius_error(run), radius_error(run, s.ring_offset)
     pull_step = np.diff(s.v_p, axis=0, prepend=run.start.v_p)
     heater_step = np.diff(s.Q_H, axis=0, prepend=run.start.Q_H)
-    drives = (np.where(alive, moved, 0.0) for moved in (s.v_p - v_0, pull_step, heater_step))
+    terms = sum(getattr(s, f"term_{name}") for name in process.Cost._fields)
+    largest = process.cost_terms(process.Cost(observable, 0.0, 0.0, 0.0), process.weights)
     return Metrics(
         rmse_mm=_rms(error, counts) / MM,
         rmse_observable_mm=_rms(observable, counts) / MM,
@@ -88,7 +86,7 @@ def metrics(run: Rollout) -> Metrics:
         time_at_limits=np.mean(_at_limits(run), axis=0, where=alive),
         growth_rate_rms_mm_per_min=_rms(grows - v_0, alive) / MM_PER_MIN,
         ground_off_pct=_ground_off(value, alive),
-        cost=np.sum(process.cost_terms(observable, *drives), axis=0).mean(axis=0, where=counts),
+        cost=np.where(lost, largest[0], terms).mean(axis=0, where=counts),
         failure_rate=run.failed.astype(np.float64),
         return_=run.reward.sum(axis=0),
     )

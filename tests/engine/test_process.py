@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
 from cz_gym import CzEnv, CzVectorEnv
-from cz_gym.body.cost import Cost, cost_slopes, cost_terms, reward
+from cz_gym.body.cost import WEIGHTS, Cost, cost_slopes, cost_terms, reward
 from cz_gym.config import make_config
 from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.episodes.schedule import bias_offset, recipe, reference
@@ -74,7 +74,7 @@ class Lean(NamedTuple):
 
 
 LOG = {"h": LEVEL, "succeeded": ONE, "h_ref": LEVEL, "T": WARM, "v_p": FALL, "Q_H": HEAT, "ring_offset": LEVEL}
-LOG |= {f"cost_{name}": ONE for name in Cost._fields} | {"action_clipped": ONE}
+LOG |= {f"term_{name}": ONE for name in Cost._fields} | {"action_clipped": ONE}
 Log: Any = NamedTuple("Log", [(name, Annotated[Any, channel]) for name, channel in LOG.items()])
 
 
@@ -131,7 +131,7 @@ def logged(slot, measured, cost, t, ring, m):
 @jittable
 def charged(x, u, before, extra, slot, t):
     error = x.h - slot.puller.h_0 - reference(t, slot.episode) + bias_offset(t, slot.episode)
-    return Cost(error, u.v_p - slot.puller.v_0 + 0.0 * extra.fed, u.v_p - before.v_p, u.Q_H - before.Q_H)
+    return Cost(error, u.v_p / slot.puller.v_0 - 1.0 + 0.0 * extra.fed, u.v_p - before.v_p, u.Q_H - before.Q_H)
 
 
 TANK = Process(
@@ -141,7 +141,7 @@ TANK = Process(
     rates=rates, accept=accept, see=jittable(lambda x, p, m: Seen(x.h, x.h, 0.0 * x.h, x.T)), measure=measure,
     true_state=jittable(lambda slot, seen, t: Truth(slot.x.h - slot.puller.h_0, slot.x.T - slot.puller.T_0)),
     logged=logged, lean=jittable(lambda slot, seen: Lean(slot.x.h, slot.puller.h_0 + seen.h_ref)), charged=charged,
-    cost_terms=cost_terms, cost_slopes=cost_slopes, reward=reward, equations=(derive, rates), Extra=Extra,
+    cost_terms=cost_terms, cost_slopes=cost_slopes, reward=reward, equations=(derive, rates), Extra=Extra, weights=WEIGHTS,
     carry=jittable(lambda extra, u, p, interval: Extra(extra.fed + u.v_p * interval)), table=(3, 2),
 )  # fmt: skip
 # The end of the process.

@@ -90,7 +90,7 @@ class Watch:
 
     def _check_rewards(self, ran, reward, terminated, infos):
         """The reward is one minus the saturated cost of ``info``, and 1,000 less for a failing step."""
-        cost = sum(infos[f"cost_{name}"] for name in Cost._fields)
+        cost = sum(infos[f"term_{name}"] for name in Cost._fields)
         expected = np.where(ran, 1.0 - 10.0 * cost / (10.0 + cost) - 1000.0 * terminated, 0.0)
         self._need(np.abs(reward - expected) < _EPS, "the reward does not follow from the cost")
         self._need(cost >= 0.0, "a negative cost")
@@ -117,14 +117,17 @@ class Watch:
             + p["C_2"] * (new["T_2"] - old["T_2"])
             + p["C_b"] * melt * (new["T_b"] - old["T_b"])
         )
-        flows = 0.5 * (_losses(p, old) + _losses(p, new))
-        gained = self._dt * (infos["Q_H"] - flows - p["Q_i"] + self._slots["Q_d"])
+        dT_i = self._slots["dT_i"]
+        flows = 0.5 * (_losses(p, old, dT_i) + _losses(p, new, dT_i))
+        gained = self._dt * (infos["Q_H"] - flows + self._slots["Q_d"])
         missing = np.where(living, np.abs(stored - gained) / (self._dt * p["Q_H_0"]), 0.0)
         self._need(missing <= BALANCE, "heat appears or disappears")
         self.missing_heat = max(self.missing_heat, float(missing.max()))
 
 
-def _losses(p, x):
-    """Heat that insulation and melt surface lose [W]."""
-    surface = p["kappa_b"] * (fourth_power(x["T_b"]) - fourth_power(p["T_e"]))
-    return p["G_1a"] * (x["T_1"] - p["T_a"]) + surface
+def _losses(p, x, dT_i):
+    """Heat that insulation and melt surface lose and that the crystal takes [W]."""
+    crystal = np.pi * x["r_c"] ** 2
+    Phi_l = p["k_l"] * (x["T_b"] + dT_i - p["T_m"]) * (p["lam"] / x["h_c"] + (1.0 - p["lam"]) / p["h_0"])
+    surface = p["emission"] * (p["R_cr"] ** 2 - x["r_c"] ** 2) * (fourth_power(x["T_b"]) - fourth_power(p["T_e"]))
+    return p["G_1a"] * (x["T_1"] - p["T_a"]) + surface + crystal * Phi_l

@@ -141,10 +141,11 @@ def settings_of(config: Config, puller: Puller | None = None) -> tuple[Port, ...
 
 
 def readings_of(given: Any, ranges: tuple[float, float]) -> tuple[Measured, Measured]:
-    """Readings as deviations in SI units, and whether each lies within the range of the observations."""
+    """Readings as deviations in SI units, and whether each lies within the range of the observations; the mean pull
+    speed, which is no reading, is the pull speed."""
     seen = {each: (given[port] - given[nominal]) * unit for each, (port, nominal, _, unit) in READINGS.items()}
     ring = (given["ring_radius_mm"] - given["ring_bias_mm"] - given["r_ref_mm"]) * MM
-    read = Measured(ring_error=ring, valid=np.where(given["valid"] > 0.5, 1.0, 0.0), **seen)
+    read = Measured(ring_error=ring, valid=np.where(given["valid"] > 0.5, 1.0, 0.0), v_p_mean=seen["v_p"], **seen)
     limits = 1.001 * CLIP * scales(MEASURED, *ranges)
     return read, Measured(*(np.abs(value) <= limit for value, limit in zip(read, limits, strict=True)))
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym.body.cost import moved_mean
 from cz_gym.observation import Measured, readable
 from cz_gym.support.units import MINUTE
 
@@ -157,6 +158,8 @@ def sample_of(facts: Facts, call: Call, manual: Any, given: Any, memory: Memory)
     trusted = Measured(*(np.where(each, value, np.inf) for each, value in zip(good, seen, strict=True)))
     read = readable(trusted._replace(valid=np.where(ring, 1.0, 0.0)), last)
     read = read._replace(T_1=np.where(pyrometer, seen.T_1, np.where(call.starts, 0.0, expected)))
+    mean = np.where(call.starts, read.v_p, moved_mean(last.v_p_mean, read.v_p, facts.dt))
+    read = read._replace(v_p_mean=mean)
     shown = np.where(finite(seen.T_1), seen.T_1, np.inf)
     return Readings(read, trusted.T_1, plausible, ring, pyrometer, reference, shown, still)
 

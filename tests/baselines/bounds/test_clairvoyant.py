@@ -10,8 +10,8 @@ from scipy.optimize import minimize
 from cz_gym.baselines.bounds import trajectory
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.bounds.future import future_of
-from cz_gym.baselines.bounds.trajectory import Limits, limits_of, optimise
-from cz_gym.body.cost import cost_terms
+from cz_gym.baselines.bounds.trajectory import Limits, limits_of, mean_pull, optimise
+from cz_gym.body.cost import Cost, cost_terms
 from cz_gym.body.plant import Inputs, State
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Actuators
@@ -46,7 +46,8 @@ def planned_cost(future, x, u):
     v_0, Q_H_0 = future.puller.inputs_0
     v_p, Q_H = u[..., 0], u[..., 1]
     moves = (np.diff(v, axis=0, prepend=np.broadcast_to(rest, v[:1].shape)) for v, rest in ((v_p, v_0), (Q_H, Q_H_0)))
-    return sum(cost_terms(x[1:, :, 0] - future.target, v_p - v_0, *moves)).sum(axis=0)
+    mean = mean_pull(v_p, v_0, float(future.lengths[:, 0].sum()))
+    return sum(cost_terms(Cost(x[1:, :, 0] - future.target, mean, *moves))).sum(axis=0)
 
 
 def played(u, inputs_0):
