@@ -40,6 +40,7 @@ def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
             options = {"log_std_init": recipe.log_std_init}
         case SAC():
             kind, policy, critics = stable_baselines3.SAC, AsymmetricSACPolicy, "qf"
+            options = {"activation_fn": torch.nn.Tanh}
         case _:
             raise TypeError(f"no algorithm for a {type(recipe).__name__}")
     known = {name for each in kind.__mro__ for name in inspect.signature(each.__init__).parameters}

@@ -101,14 +101,17 @@ class PPO(Reinforcement):
 
 @dataclass(frozen=True, kw_only=True)
 class SAC(Reinforcement):
-    """Soft actor-critic."""
+    """Soft actor-critic; its actor has PPO's estimate, its critics read products of state and action
+    (:class:`cz_gym.agents.asymmetric.StateCritic`)."""
 
     name: str = "sac"
+    hidden: tuple[int, ...] = (32, 32)
     critic_hidden: tuple[int, ...] = (128, 128)
-    steps: int = 12_000_000
+    steps: int = 5_000_000
     num_envs: int = 256
     action_repeat: int = 4
-    gamma: float = 0.97
+    n_steps: int = 4
+    """Actions whose rewards a target has."""
     buffer_size: int = 1_000_000
     learning_starts: int = 10_000
     """Actions before the first update."""

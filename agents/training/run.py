@@ -23,7 +23,7 @@ from cz_gym.support.atomic_files import write_files
 from . import validation
 from .algorithms import make_algorithm, repeat_of
 from .checkpoint import load_checkpoint, restore, to_bytes
-from .recipes import PPO, Recipe
+from .recipes import Recipe, Reinforcement
 from .run_files import check_settings, identity, provenance, read_rows, to_csv, to_json
 from .validation import COLUMNS, REFERENCES, References, validate
 
@@ -109,7 +109,7 @@ class Run:
         with deferred_interrupt() as interrupted:
             if self.steps < self.recipe.steps:
                 left = -(-(self.recipe.steps - self.steps) // repeat_of(self.recipe))
-                fits: list[BaseCallback] = [LearnState()] if isinstance(self.recipe, PPO) else []
+                fits: list[BaseCallback] = [LearnState()] if isinstance(self.recipe, Reinforcement) else []
                 self.algorithm.learn(left, [*fits, _Watch(self, bar, interrupted)], reset_num_timesteps=False)
             if not self.rows or int(self.rows[-1]["steps"]) < self.steps:
                 self.validate(bar)
