@@ -177,9 +177,7 @@ class LearnState(BaseCallback):
     def _init_callback(self) -> None:
         policy: Any = needs(Asymmetric, self.model.policy, "LearnState fits the estimate of such a policy alone")
         on_policy = isinstance(policy, AsymmetricPolicy)
-        self.estimator: StateEstimator = (
-            policy.pi_features_extractor if on_policy else policy.actor.features_extractor
-        )
+        self.estimator: StateEstimator = policy.pi_features_extractor if on_policy else policy.actor.features_extractor
         self.optimizer = torch.optim.Adam(self.estimator.estimate.parameters())
 
     def _on_step(self) -> bool:

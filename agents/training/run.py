@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import configure_logger
 
 from cz_gym.agents.agent_file.contract import agent_files, read_json
-from cz_gym.agents.asymmetric import LearnState
+from cz_gym.agents.asymmetric import Asymmetric, LearnState
 from cz_gym.agents.export import to_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.sb3 import environment_steps
@@ -23,7 +23,7 @@ from cz_gym.support.atomic_files import write_files
 from . import validation
 from .algorithms import make_algorithm, repeat_of
 from .checkpoint import load_checkpoint, restore, to_bytes
-from .recipes import Recipe, Reinforcement
+from .recipes import Recipe
 from .run_files import check_settings, identity, provenance, read_rows, to_csv, to_json
 from .validation import COLUMNS, REFERENCES, References, validate
 
@@ -109,7 +109,7 @@ class Run:
         with deferred_interrupt() as interrupted:
             if self.steps < self.recipe.steps:
                 left = -(-(self.recipe.steps - self.steps) // repeat_of(self.recipe))
-                fits: list[BaseCallback] = [LearnState()] if isinstance(self.recipe, Reinforcement) else []
+                fits: list[BaseCallback] = [LearnState()] if isinstance(self.algorithm.policy, Asymmetric) else []
                 self.algorithm.learn(left, [*fits, _Watch(self, bar, interrupted)], reset_num_timesteps=False)
             if not self.rows or int(self.rows[-1]["steps"]) < self.steps:
                 self.validate(bar)

@@ -92,7 +92,7 @@ class Puller(NamedTuple):
     G_2b: float
     """Conductance of the quartz wall [W/K]."""
     emission: float
-    """Radiation of a melt surface of one square metre times pi, pi eps sigma_SB [W/m2/K4]."""
+    """Radiation of the melt surface, eps sigma_SB [W/m2/K4]."""
     R_cr: float
     """Radius of the crucible [m]."""
     T_e: float
@@ -147,10 +147,11 @@ def derive_puller(q: Any, lam: Any, height: Any, ring_offset: Any) -> Any:
     Phi_l_0 = q.k_l * q.dT_0 / h_0
     rho_dH = q.rho_s * q.dH
     Phi_s = Phi_l_0 + rho_dH * q.v_0
-    emission = math.pi * q.eps * q.sigma_SB
+    emission = q.eps * q.sigma_SB
     T_b_0 = q.T_m + q.dT_0
-    surface = emission * (q.R_cr * q.R_cr - q.r_0 * q.r_0) * (T_b_0**4 - q.T_e**4)
-    through = surface + math.pi * q.r_0 * q.r_0 * Phi_l_0
+    covered = math.pi * q.r_0 * q.r_0
+    surface_loss = emission * (math.pi * q.R_cr * q.R_cr - covered) * (T_b_0**4 - q.T_e**4)
+    through = surface_loss + covered * Phi_l_0
     T_2_0 = T_b_0 + through / q.G_2b
     T_1_0 = np.sqrt(np.sqrt(T_2_0**4 + through / q.kappa_12))
     Q_H_0 = through + q.G_1a * (T_1_0 - q.T_a)
@@ -212,9 +213,10 @@ def rates(x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
     at_interface = growth(x, d, p, slope)
     radiated = p.kappa_12 * (fourth_power(x.T_1) - fourth_power(x.T_2))
     into_melt = p.G_2b * (x.T_2 - x.T_b)
-    crystal = x.r_c * x.r_c
-    surface_loss = p.emission * (p.R_cr * p.R_cr - crystal) * (fourth_power(x.T_b) - fourth_power(p.T_e))
-    into_crystal = math.pi * crystal * at_interface.Phi_l
+    covered = math.pi * x.r_c * x.r_c
+    open_surface = math.pi * p.R_cr * p.R_cr - covered
+    surface_loss = p.emission * open_surface * (fourth_power(x.T_b) - fourth_power(p.T_e))
+    into_crystal = covered * at_interface.Phi_l
     return State(
         at_interface.v_g * at_interface.tan_alpha,
         u.v_p - at_interface.v_g,

@@ -129,5 +129,5 @@ def _losses(p, x, dT_i):
     """Heat that insulation and melt surface lose and that the crystal takes [W]."""
     crystal = np.pi * x["r_c"] ** 2
     Phi_l = p["k_l"] * (x["T_b"] + dT_i - p["T_m"]) * (p["lam"] / x["h_c"] + (1.0 - p["lam"]) / p["h_0"])
-    surface = p["emission"] * (p["R_cr"] ** 2 - x["r_c"] ** 2) * (fourth_power(x["T_b"]) - fourth_power(p["T_e"]))
+    surface = p["emission"] * (np.pi * p["R_cr"] ** 2 - crystal) * (fourth_power(x["T_b"]) - fourth_power(p["T_e"]))
     return p["G_1a"] * (x["T_1"] - p["T_a"]) + surface + crystal * Phi_l
