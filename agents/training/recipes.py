@@ -10,7 +10,6 @@ from typing import Self
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.user_code import scenarios
 
-
 LEAST_ENVS, LEAST_BATCH = 8, 64
 """Least number of crystals at a time, and of samples in a batch, on a small budget."""
 FEW_UPDATES = 50
