@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -138,11 +139,12 @@ class Run:
             **{f"{name}_rmse_mm": judged for name, (_, judged) in self.job.references.items()},
             "pull_step_rms_mm_per_min": figures.pull_step_rms_mm_per_min,
             "failure_rate": figures.failure_rate,
-            "training_steps": agent.contract.training_steps,
+            "chosen_at": agent.contract.training_steps,
             "steps": self.steps,
             "seconds": time.monotonic() - self.began,
         }
-        self._hold(agent_files(path, agent.content, figures.put_into(agent.contract)))
+        whole_run = replace(agent.contract, training_steps=self.steps)
+        self._hold(agent_files(path, agent.content, figures.put_into(whole_run)))
         self._hold({self.folder / "summary.json": to_json(summary)})
         self.save()
         return summary
