@@ -9,6 +9,7 @@ from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import ALIASES, find_scenario
 from cz_gym.errors import CzError
+from cz_gym.jit.code_hash import function_hash
 from cz_gym.machine.puller import DEFAULT, PullerFile
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
@@ -138,7 +139,10 @@ def find_row(name: str) -> Row:
 
 
 def contract_hash(rows: Sequence[Row]) -> str:
-    """Return the hash of what figures rest on: plant, scenarios, control interval and horizon of the random rows."""
-    random = [row for row in rows if not find_scenario(row.scenario).deterministic]
-    parts = sorted(row.config().hash for row in random or rows)
+    """The hash of what figures rest on: plant, scenarios, interval, horizon of the random rows; reward and metrics."""
+    from .metrics import metrics
+
+    random = [row.config() for row in rows if not find_scenario(row.scenario).deterministic]
+    configs = random or [row.config() for row in rows]
+    parts = [*sorted(config.hash for config in configs), configs[0].reward_hash, function_hash(metrics)]
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:12]
