@@ -28,6 +28,8 @@ class Metrics(NamedTuple):
 
     rmse_mm: Floats
     """Root mean square of r_c - r_ref [mm]."""
+    rmse_survivors_mm: Floats
+    """The same of a crystal that is not lost; NaN if it is [mm]."""
     rmse_observable_mm: Floats
     """Root mean square of r_c against r_ref minus the ring offset that no sensor shows [mm]."""
     max_error_mm: Floats
@@ -76,6 +78,7 @@ def metrics(run: Rollout) -> Metrics:
     largest = process.cost_terms(process.Cost(observable, 0.0, 0.0, 0.0), process.weights)
     return Metrics(
         rmse_mm=_rms(error, counts) / MM,
+        rmse_survivors_mm=np.where(run.failed, np.nan, _rms(error, counts) / MM),
         rmse_observable_mm=_rms(observable, counts) / MM,
         max_error_mm=np.abs(error).max(axis=0, where=counts, initial=0.0) / MM,
         within_half_mm=np.mean(np.abs(error) <= TOLERANCE, axis=0, where=counts),
