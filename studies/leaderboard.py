@@ -83,7 +83,7 @@ def page(results: Sequence[Result], claims: Claims, rows: Sequence[Row]) -> str:
         lines.append((spent, str(places[spent]), name, told, seeds, f"{claim:.3f}", own, lost, same))
     seeds = f"{rows[0].first_seed} to {results[0].seeds[-1]}"
     about = (
-        f"Submitted agents on {len(results[0].seeds)} fresh crystals of each scenario (seeds {seeds}), ranked by mean RMSE. "
+        f"Submitted agents on {len(results[0].seeds)} fresh crystals of each scenario (seeds {seeds}), by mean RMSE. "
         f'"Claimed" and "here" are the RMSE on {rows[0].name}, from the submission and from these crystals.'
     )
     beside = "Every scenario, beside classical controllers:"
