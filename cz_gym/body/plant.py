@@ -252,7 +252,3 @@ def hidden_load(p_drift: Any, p: Any) -> Any:
 def disturbance(t: Any, dT_i: Any, e: Any, p: Any) -> Disturbance:
     """Disturbance at a point t [s] of the 5 s grid, with the interface fluctuation [K] drawn there."""
     return Disturbance(hidden_load(drift(t, e), p), dT_i, melt_left(t, e))
-
-
-EQUATIONS = (derive_puller, rates, rk4, hidden_load)
-"""The functions that define the plant, for :attr:`cz_gym.config.Config.plant_hash`."""

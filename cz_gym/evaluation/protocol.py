@@ -4,12 +4,12 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from cz_gym.body.cost import PULL_TOLERANCE, TOLERANCE
 from cz_gym.body.process import BODY
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import ALIASES, find_scenario
 from cz_gym.errors import CzError
-from cz_gym.jit.code_hash import function_hash
 from cz_gym.machine.puller import DEFAULT, PullerFile
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
@@ -140,9 +140,10 @@ def find_row(name: str) -> Row:
 
 def contract_hash(rows: Sequence[Row]) -> str:
     """The hash of what figures rest on: plant, scenarios, interval, horizon of the random rows; reward and metrics."""
-    from .metrics import metrics
+    from .metrics import ALMOST, PULL_WINDOW, metric_names
 
     random = [row.config() for row in rows if not find_scenario(row.scenario).deterministic]
     configs = random or [row.config() for row in rows]
-    parts = [*sorted(config.hash for config in configs), configs[0].reward_hash, function_hash(metrics)]
+    parts = [*sorted(config.hash for config in configs), configs[0].reward_hash, *metric_names()]
+    parts += [str(number) for number in (PULL_WINDOW, PULL_TOLERANCE, TOLERANCE, ALMOST)]
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:12]
