@@ -166,6 +166,8 @@ class SAC(Reinforcement):
     tau: float = 0.01
     ent_coef: str = "auto_0.005"
     """Initial weight of the entropy; it adapts."""
+    target_entropy: float = -2.0
+    """Entropy of an action's distribution that the weight adapts to."""
 
     @property
     def steps_between(self) -> int:

@@ -29,7 +29,8 @@ def stretched(by):
 
 def test_two_menisci_of_one_factory_are_two_plants():
     hashes = {make_config(meniscus=stretched(by)).plant_hash for by in (1.0, 1.01, 1.02)}
-    assert len({*hashes, make_config().plant_hash}) == 4
+    assert len(hashes) == 3
+    assert make_config().plant_hash in hashes
     assert make_config(meniscus=stretched(1.01)).plant_hash in hashes
     assert make_config(meniscus=HURLE._replace(name="another name")).plant_hash == make_config().plant_hash
 
