@@ -27,7 +27,7 @@ class LQGDesign:
     """Everything that is chosen about an LQG."""
 
     noise: NoiseModel = field(default_factory=NoiseModel)
-    weights: Weights = Weights(pull=0.5)
+    weights: Weights = field(default_factory=lambda: Weights(pull=0.5))
     """Weights of the regulator's quadratic cost, whose term of the pull speed has no band."""
     lam: float = 0.5
     """Share of conduction at the design point [-]."""
