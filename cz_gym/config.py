@@ -157,7 +157,7 @@ class Config:
         return Identity(
             *(VERSION, self.plant_hash, scenario, mix, seen, self.action, self.control_interval, self.horizon),
             self.puller.label,
-            ", ".join(f"{name} {weight:g}" for name, weight in self.weights._asdict().items()),
+            ", ".join(f"{name} {weight}" for name, weight in self.weights._asdict().items()),
         )
 
     def with_scenario(self, scenario: AnyScenario) -> Self:
@@ -213,7 +213,7 @@ def make_config(
         *(drawn_from, model, observation, action, interval, length, checked, meniscus or HURLE, checked_camera),
         puller=machine,
         process=process,
-        weights=_weights(weights or {}, process.weights),
+        weights=process.weights if weights is None else _weights(weights, process.weights),
     )
 
 

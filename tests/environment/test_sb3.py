@@ -108,7 +108,7 @@ def test_methods_and_attributes_reach_the_slots_that_are_named_as_in_sb3s_own_ve
     both(lambda env: env.reset())
     both(lambda env: env.step(action)[:3])
     ((seen, info),) = both(lambda env: env.env_method("reset", seed=8, indices=[1]))
-    assert (seen.shape, set(info)) == ((72,), {"r_c", "r_ref"})
+    assert (seen.shape, set(info)) == ((73,), {"r_c", "r_ref", "cost"})
     both(lambda env: env.env_method("reset", options={"scenario": "nominal"}, indices=2))
     assert len(both(lambda env: env.env_method("reset"))) == N
     saved = ours.env_method("get_state", indices=[0])
@@ -205,7 +205,7 @@ def test_an_estimate_is_fitted_to_the_state_and_not_to_the_reward():
     model.learn(960, LearnState())
     assert estimator.loss(seen).item() < 0.75 * start
     with torch.no_grad():  # an estimator that is right, in the units of its features
-        state = seen[:, estimator.gains.numel() :][:, [0, 1, 2, 3, 4, 13, 14, 15, 16]] * estimator.state_gains
+        state = seen[:, estimator.gains.numel() :][:, [0, 1, 2, 3, 4, 14, 15, 16, 17]] * estimator.state_gains
         estimator.estimate.forward = lambda _: state
         assert estimator.loss(seen).item() == 0.0
-        torch.testing.assert_close(estimator(seen)[:, 12:], state)
+        torch.testing.assert_close(estimator(seen)[:, 13:], state)
