@@ -118,7 +118,9 @@ class Watch:
             + p["C_b"] * melt * (new["T_b"] - old["T_b"])
         )
         flows = 0.5 * (_losses(p, old) + _losses(p, new))
-        gained = self._dt * (infos["Q_H"] - flows + self._slots["Q_d"]) - _into_crystal(p, old, new, infos, self._dt)
+        behind = self._slots["episode"]["heater_lag"] * (self._slots["Q_heats"] - self._old["Q_heats"])
+        gained = self._dt * (infos["Q_H"] - flows + self._slots["Q_d"]) - behind
+        gained -= _into_crystal(p, old, new, infos, self._dt)
         missing = np.where(living, np.abs(stored - gained) / (self._dt * p["Q_H_0"]), 0.0)
         self._need(missing <= BALANCE, "heat appears or disappears")
         self.missing_heat = max(self.missing_heat, float(missing.max()))
