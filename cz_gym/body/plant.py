@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.engine.arithmetic import rk4 as runge_kutta
 from cz_gym.episodes.schedule import drift, melt_left
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import force_inlined, jittable
+from cz_gym.physics.arithmetic import rk4 as runge_kutta
 from cz_gym.physics.meniscus import HURLE, MeniscusModel, ring_point
 from cz_gym.physics.parameters import Parameters, check_parameters
 from cz_gym.process import NO_OPERATING_POINT
