@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cz_gym import agents
 from cz_gym.agents import shipped_names
 from cz_gym.agents.agent_file.contract import write_agent
 from cz_gym.baselines.registry import CONTROLLERS
