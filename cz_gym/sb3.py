@@ -43,9 +43,9 @@ class CzVecEnv(VecEnv):
 
     Observations are float32, shape (num_envs, channels); ``infos`` are empty except for slots whose episode ended: they
     hold ``terminal_observation``, ``TimeLimit.truncated`` and ``episode``: return, length and time, as those of
-    stable-baselines3's ``Monitor``, and "c", the sum of the steps' ``info["cost"]``. Those of the last step are in ``cost``, shape
-    (num_envs,). With ``stagger``, a seed, each slot's first episode is cut (truncated) at a random
-    step, so that slots are not all in the same minute. With ``critic_state`` the plant's true state
+    stable-baselines3's ``Monitor``, and "c", the sum of the steps' ``info["cost"]``. ``cost`` has those of the last
+    step, shape (num_envs,). With ``stagger``, a seed, each slot's first episode is cut (truncated) at a random step, so
+    that slots are not all in the same minute. With ``critic_state`` the plant's true state
     (:class:`cz_gym.body.signals.TrueState`) follows the channels of ``observation="history"``, for a
     policy of :mod:`cz_gym.agents.asymmetric`; the batch needs ``info="all"``.
     """

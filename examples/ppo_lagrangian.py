@@ -1,6 +1,6 @@
 """Train PPO under a constraint: few steps out of tolerance (``info["cost"]``): ``python -m examples.ppo_lagrangian``.
 
-A Lagrange multiplier, the price of a step out of tolerance, rises while their share is above the limit, and falls below.
+A Lagrange multiplier is the price of such a step: it rises while their share is above the limit, and falls below.
 """
 
 import sys
@@ -72,6 +72,7 @@ def main(
     settings: Any = {"n_steps": 64, "batch_size": 2 * num_envs, "n_epochs": 5, "policy_kwargs": {"log_std_init": -0.7}}
     model = PPO("MlpPolicy", env, lambda left: 1e-3 * left, seed=seed, device="cpu", **settings)
     model.learn(steps // 4, DualAscent(priced), progress_bar=sys.stderr.isatty())
+    model.set_env(ActionRepeat(priced.venv, 4))  # the prices are no part of the agent
     return save_agent(out, model, "ppo-lagrangian"), priced.multiplier
 
 
