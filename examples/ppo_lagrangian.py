@@ -73,7 +73,7 @@ def main(
     model = PPO("MlpPolicy", env, lambda left: 1e-3 * left, seed=seed, device="cpu", **settings)
     model.learn(steps // 4, DualAscent(priced), progress_bar=sys.stderr.isatty())
     model.set_env(ActionRepeat(priced.venv, 4))  # the prices are no part of the agent
-    return save_agent(out, model, "ppo-lagrangian"), priced.multiplier
+    return save_agent(out, model, "ppo-lagrangian", env), priced.multiplier
 
 
 if __name__ == "__main__":
