@@ -97,8 +97,9 @@ class CzVecEnv(VecEnv):
         self._k += 1
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         done = terminated | truncated
-        self.cost = np.where(done, info["final_info"]["cost"], info["cost"]) if done.any() else info["cost"]
-        self._costs += self.cost
+        if "cost" in info:  # not every process has one
+            self.cost = np.where(done, info["final_info"]["cost"], info["cost"]) if done.any() else info["cost"]
+            self._costs += self.cost
         for i in np.flatnonzero(done).tolist():
             last = self._shown(info["final_obs"][i], {name: of[i] for name, of in info["final_info"].items()})
             infos[i] = self._final(i, last, bool(truncated[i]))

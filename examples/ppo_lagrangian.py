@@ -29,7 +29,7 @@ class Priced(VecEnvWrapper):
 
     def __init__(self, venv: CzVecEnv) -> None:
         super().__init__(venv)
-        self.multiplier, self.outside, self.steps = 0.0, 0.0, 0
+        self.crystals, self.multiplier, self.outside, self.steps = venv, 0.0, 0.0, 0
 
     def reset(self) -> Any:
         """Reset every slot."""
@@ -38,7 +38,7 @@ class Priced(VecEnvWrapper):
     def step_wait(self) -> Any:
         """Advance every slot."""
         observation, reward, done, infos = self.venv.step_wait()
-        cost = self.venv.cost.astype(reward.dtype)
+        cost = self.crystals.cost.astype(reward.dtype)
         self.outside, self.steps = self.outside + cost.sum(), self.steps + len(cost)
         return observation, reward - self.multiplier * cost, done, infos
 
@@ -72,7 +72,7 @@ def main(
     settings: Any = {"n_steps": 64, "batch_size": 2 * num_envs, "n_epochs": 5, "policy_kwargs": {"log_std_init": -0.7}}
     model = PPO("MlpPolicy", env, lambda left: 1e-3 * left, seed=seed, device="cpu", **settings)
     model.learn(steps // 4, DualAscent(priced), progress_bar=sys.stderr.isatty())
-    model.set_env(ActionRepeat(priced.venv, 4))  # the prices are no part of the agent
+    model.set_env(ActionRepeat(priced.crystals, 4))  # the prices are no part of the agent
     return save_agent(out, model, "ppo-lagrangian", env), priced.multiplier
 
 

@@ -41,7 +41,7 @@ def test_the_price_of_steps_out_of_tolerance_rises_above_the_limit_and_the_rewar
     priced.multiplier = 7.0
     faster = np.float32([[0.2, 0.0], [0.0, 0.0]])
     charged = [priced.step(faster)[1] for _ in range(90)]
-    assert priced.venv.cost.tolist() == [1.0, 0.0]
+    assert priced.crystals.cost.tolist() == [1.0, 0.0]
     assert charged[-1][0] < charged[-1][1] - 7.0
 
 
