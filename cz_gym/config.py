@@ -223,7 +223,8 @@ def _weights(given: Any, usual: Any) -> Any:
     for name, weight in named.items():
         if name not in usual._fields:
             raise CzError(unknown("weight", name, usual._fields))
-        if not isinstance(weight, Real) or not 0.0 <= weight < math.inf:
+        number = isinstance(weight, Real)
+        if not number or not 0.0 <= weight < math.inf:
             raise CzError(f"the weight {name!r} must be a number of at least 0, not {weight!r}")
     return usual._replace(**{name: float(weight) for name, weight in named.items()})
 

@@ -30,6 +30,7 @@ def test_the_adapter_equals_sb3s_own_vector_of_scalars():
         env.seed(5)
     np.testing.assert_array_equal(ours.reset(), theirs.reset())
     failed = truncated = 0
+    costs, sums = np.zeros(N), []
     for _ in range(90):
         actions = rng.uniform(-0.1, 0.1, (N, 2)).astype(np.float32)
         actions[0] = 1.0
@@ -37,6 +38,9 @@ def test_the_adapter_equals_sb3s_own_vector_of_scalars():
         for a, b in zip(one[:3], other[:3], strict=True):
             np.testing.assert_array_equal(a, b)
             assert a.dtype == b.dtype
+        costs += [its["cost"] for its in other[3]]
+        sums += [(mine["episode"]["c"], cost) for mine, cost in zip(one[3], costs, strict=True) if mine]
+        costs[one[2]] = 0.0
         for done, mine, its in zip(one[2], one[3], other[3], strict=True):
             assert ("terminal_observation" in mine) == bool(done)
             if done:
@@ -45,6 +49,8 @@ def test_the_adapter_equals_sb3s_own_vector_of_scalars():
                 truncated += mine["TimeLimit.truncated"]
                 failed += not mine["TimeLimit.truncated"]
     assert min(failed, truncated) > 0, "both kinds of end must have happened"
+    assert all(mine == its for mine, its in sums)
+    assert len(set(sums)) > 2
 
 
 def test_evaluation_sees_the_environment_s_own_returns():
