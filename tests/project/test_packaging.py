@@ -1,12 +1,15 @@
 """Installation: one package with four dependencies, by every way of installing it."""
 
+import importlib
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tarfile
 import tomllib
 import zipfile
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -121,6 +124,45 @@ def test_outside_the_virtual_environment_one_line_says_so(command):
     assert done.returncode != 0
     assert "gymnasium is missing: run .venv/bin/python" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def brought(requirements, extras=(), found=()):
+    """Names of the packages that pip installs for requirements, with all that they require themselves."""
+    found = set(found)
+    for each in map(importlib.import_module("packaging.requirements").Requirement, requirements):
+        if each.marker and not any(each.marker.evaluate({"extra": extra}) for extra in ("", *extras)):
+            continue
+        if (name := plain(each.name)) not in found or each.extras:
+            found |= brought(metadata.requires(name) or [], each.extras, found | {name})
+    return found
+
+
+def plain(name):
+    return re.sub("[-_.]+", "-", name).lower()
+
+
+USES = {
+    "benchmark": "run('benchmark --controllers paper --scenarios nominal --episodes 1 --quiet --out', out)",
+    "agents": "import cz_gym.agents.training.fleet, cz_gym.agents.apg, cz_gym.agents.export, cz_gym.agents.asymmetric",
+    "render": "import gymnasium; e = gymnasium.make('cz_gym:Cz-v0', render_mode='rgb_array'); e.reset(); e.render()",
+    "mpc": "from cz_gym.baselines import mpc, registry as r; import cz_gym.config as c; r.find_controller('ekf-mpc')",
+    "data": "run('data --policies paper --scenarios nominal --episodes 1 --out', out)",
+    "plant": "import cz_gym.machine.serve.__main__; run('export --plant --to fmu --out', out)",
+}
+"""What a user of each extra does with it."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("extra", USES)
+def test_an_extra_alone_brings_all_that_its_use_needs(extra, tmp_path):
+    """Minari imports Pillow and does not require it: it was there because matplotlib was."""
+    pytest.importorskip("packaging.requirements")
+    names = brought([*PROJECT["dependencies"], *PROJECT["optional-dependencies"][extra]])
+    owners = metadata.packages_distributions().items()
+    absent = {module for module, of in owners if not {"cz-gym", "setuptools", *names} & set(map(plain, of))}
+    run = "def run(words, out):\n    assert main([*words.split(), out]) == 0\n"
+    code = f"from cz_gym_command import main\n{run}out = {str(tmp_path / 'out')!r}\n{USES[extra]}"
+    python("-c", ABSENT.replace("{absent}", repr(absent)) + code, cwd=ROOT)
 
 
 @pytest.fixture(scope="module")
