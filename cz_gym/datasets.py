@@ -6,7 +6,6 @@ true state. Datasets of different policies can therefore be joined, and seed and
 
 import argparse
 import os
-import pkgutil
 import re
 import shutil
 import sys
@@ -15,10 +14,10 @@ import warnings
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
-from functools import lru_cache
+from functools import partial
 from importlib import import_module
+from itertools import repeat
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import gymnasium as gym
@@ -28,89 +27,25 @@ from scipy.signal import lfilter
 
 import cz_gym
 from cz_gym.action import drives_of
-from cz_gym.config import Config, check_config, make_config
+from cz_gym.behaviour import find_policy, own_noise, reference_scores, settings_of
+from cz_gym.config import Config, make_config
 from cz_gym.errors import CzError
-from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
-from cz_gym.evaluation.rollout import informed, rollout
-from cz_gym.machine.identify.excitation import Excited
+from cz_gym.evaluation.processes import side_by_side
+from cz_gym.evaluation.protocol import TRAINING_SEEDS
+from cz_gym.evaluation.rollout import informed
 from cz_gym.machine.puller import DEFAULT, PullerFile, chosen_puller, to_toml
 from cz_gym.observation import DRIVE_CHANNELS, to_measured
 from cz_gym.support.atomic_files import check_writable
 from cz_gym.support.command_line import OneLineParser, between
-from cz_gym.support.names import unknown
 from cz_gym.vector import CzVectorEnv
 
-CONTROLLERS, AGENTS = "cz_gym.baselines.registry:CONTROLLERS", "cz_gym.agents:load"
-"""Names of the objects that provide policies; imported only when needed, because this package knows no policy."""
 EPISODES, NOISE = 100, 0.2
 """Default number of episodes, and default highest level of the excitation [-]."""
 AT_ONCE = 100
 """Number of episodes in one batch."""
-STREAM, RANDOM_STREAM = 1, 2
-"""Random streams of the excitation and of random actions, separate from that of the crystal with the same seed."""
-MIXED = "paper", "lqg", "pid-uncompensated", "random"
-"""Policies that take turns in the set "mixed"; the last two lose crystals."""
+STREAM = 1
+"""Random stream of the excitation, separate from that of the crystal with the same seed."""
 CODE = "https://github.com/cz-gym/cz-gym"
-
-
-class Random:
-    """A policy of uniform random "smooth" actions; each crystal's seed gives its own."""
-
-    settings = MappingProxyType({"action": "smooth"})
-
-    def __init__(self, seeds: Sequence[int] = ()) -> None:
-        self.streams = [np.random.default_rng([seed, RANDOM_STREAM]) for seed in seeds]
-
-    def for_episodes(self, config: Config, seeds: Sequence[int]) -> "Random":
-        """The policy for one episode a seed."""
-        return Random(seeds)
-
-    def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[Any, Any]:
-        """Return actions, shape (episodes, 2)."""
-        return np.array([stream.uniform(-1.0, 1.0, 2) for stream in self.streams], np.float32), state
-
-
-def find_policy(name: str, config: Config) -> Any:
-    """The policy of that name, made for a config; a tuple of several for "mixed". CzError lists the known names.
-
-    It is a controller, a shipped agent, an agent's file, "random" or "operator", a PID with small moves of the drives
-    on top, as an operator's log for identification has them.
-    """
-    controllers = {entry.name: entry for entry in pkgutil.resolve_name(CONTROLLERS) if not entry.privileged}
-    check_config(config)
-    if name in controllers:
-        return controllers[name].make(config)
-    if name in (own := {"random": Random, "operator": lambda: Excited(find_policy("paper", config))}):
-        return own[name]()
-    if name == "mixed":
-        return tuple(find_policy(each, config) for each in MIXED)
-    load = pkgutil.resolve_name(AGENTS)
-    try:
-        settings = settings_of(load(name))
-    except ValueError as error:
-        raise CzError(unknown("policy", name, [*controllers, *own, "mixed"], f"; or an agent: {error}")) from None
-    return load(name, replace(config, **settings))
-
-
-@lru_cache(maxsize=8)
-def reference_scores(config: Config) -> dict[str, float]:
-    """Minari's ``ref_min_score`` and ``ref_max_score``: mean returns of open loop and of the best classical controller.
-
-    The crystals are the first 100 of validation; the controllers are those of the README's table.
-    """
-    table = pkgutil.resolve_name(CONTROLLERS)
-    chosen = [each for each in table if each.name == "open-loop" or (each.quoted and not each.bound)]
-    runs = [rollout(each.make(config), config, VALIDATION_SEEDS[:100]) for each in chosen]
-    means = [float(run.reward.sum(axis=0).mean()) for run in runs]
-    return {"ref_min_score": means[0], "ref_max_score": max(means)}
-
-
-def settings_of(policy: Any) -> dict[str, Any]:
-    """The environment settings "observation" and "action" of a policy; by default "measured" and "direct"."""
-    settings = {"observation": "measured", "action": "direct"} | getattr(policy, "settings", {})
-    return {name: settings[name] for name in ("observation", "action")}
 
 
 def excitation(seed: int, config: Config, noise: float) -> tuple[float, npt.NDArray[np.float64]]:
@@ -170,11 +105,6 @@ def record(policy: Any, config: Config, seeds: Sequence[int], noise: float) -> l
         }
         for i, (seed, m) in enumerate(zip(seeds, lengths.tolist(), strict=True))
     ]
-
-
-def own_noise(policy: Any, noise: float) -> float:
-    """The highest level of the excitation [-] of a policy: 0 for one that moves the drives by itself."""
-    return 0.0 if isinstance(policy, Random | Excited) else noise
 
 
 def name_of(policy: str) -> str:
@@ -248,8 +178,9 @@ def write(
         for first in range(AT_ONCE, len(seeds), AT_ONCE):
             dataset.update_dataset_from_buffer(buffers(first))
         turns = policy if isinstance(policy, tuple) else (policy,)
-        levels = [excitation(i, config, own_noise(turns[i % len(turns)], noise))[0] for i in seeds]
-        dataset.storage.update_episode_metadata([{"excitation": level} for level in levels])
+        noises = [own_noise(turns[seed % len(turns)], noise) for seed in seeds]
+        levels = map(excitation, seeds, repeat(config), noises)
+        dataset.storage.update_episode_metadata([{"excitation": level} for level, _ in levels])
         dataset.storage.update_metadata({"cz_gym_version": cz_gym.__version__, "plant_hash": config.plant_hash})
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
@@ -268,6 +199,7 @@ def main(argv: list[str] | None = None) -> int:
     add("--noise", type=float, default=NOISE, metavar="X", help="highest level of the excitation (%(default)s)")
     add("--out", type=Path, metavar="FOLDER", help="instead of $MINARI_DATASETS_PATH or ~/.minari/datasets")
     add("--overwrite", action="store_true", help="replace datasets that exist")
+    parser.add_cluster()
     parser.add_puller("record on it, at its control interval")
     return parser.run(_write_all, argv, "data", "the datasets named above are complete")
 
@@ -276,16 +208,26 @@ def _write_all(given: argparse.Namespace) -> None:
     if given.out is not None:
         os.environ["MINARI_DATASETS_PATH"] = str(given.out.resolve())
     puller = chosen_puller(given.puller)
-    chosen = [
+    settings: dict[str, Any] = {"overwrite": given.overwrite, "puller": puller, "scored": True}
+    tasks = [
         (name, find_policy(name, make_config(scenario, None, "measured", action="direct", puller=puller)), scenario)
         for scenario in given.scenarios.split(",")
         for name in given.policies.split(",")
     ]
-    for each in chosen:
-        began, seeds = time.perf_counter(), TRAINING_SEEDS[: given.episodes]
-        dataset = write(*each, seeds, given.noise, overwrite=given.overwrite, puller=puller, scored=True)
-        said = f"{dataset.id}: {dataset.total_episodes} episodes, {dataset.total_steps:,} steps, "
-        print(f"{said}{dataset.storage.get_size():.0f} MB, {time.perf_counter() - began:.1f} s", flush=True)
+    one = partial(_write_one, datasets_root().absolute(), TRAINING_SEEDS[: given.episodes], given.noise, settings)
+    on_cluster = side_by_side(one, tasks, None, given.cluster, datasets_root().absolute())
+    for _, line in on_cluster if given.cluster else enumerate(map(one, tasks)):
+        print(line, flush=True)
+
+
+def _write_one(
+    root: Path, seeds: Sequence[int], noise: float, settings: dict[str, Any], task: tuple[str, Any, str]
+) -> str:
+    """Write the set of a policy's name, the policy and a scenario into a folder of sets; one line about it."""
+    os.environ["MINARI_DATASETS_PATH"], began = str(root), time.perf_counter()
+    dataset = write(*task, seeds, noise, **settings)
+    said = f"{dataset.id}: {dataset.total_episodes} episodes, {dataset.total_steps:,} steps, "
+    return f"{said}{dataset.storage.get_size():.0f} MB, {time.perf_counter() - began:.1f} s"
 
 
 if __name__ == "__main__":

@@ -4,10 +4,11 @@ import minari
 import numpy as np
 import pytest
 
-from cz_gym import datasets
+from cz_gym import behaviour, datasets
 from cz_gym.baselines import CompensatedPID
+from cz_gym.behaviour import find_policy, settings_of
 from cz_gym.config import make_config
-from cz_gym.datasets import excitation, find_policy, main, place_of, record, settings_of, write
+from cz_gym.datasets import excitation, main, place_of, record, write
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import rollout
@@ -20,7 +21,7 @@ CONFIG = make_config("randomized", action="direct", horizon=1200.0)
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "data"))
-    monkeypatch.setattr(datasets, "VALIDATION_SEEDS", VALIDATION_SEEDS[:1])  # of the scores: 100 take 16 s
+    monkeypatch.setattr(behaviour, "VALIDATION_SEEDS", VALIDATION_SEEDS[:1])  # of the scores: 100 take 16 s
     return tmp_path / "data"
 
 
