@@ -56,7 +56,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     add("--agent", type=_agent_file, action="append", default=[], metavar="[NAME=]FILE", help=agent_help)
     own = "controller of your own, beside the classical ones of README's table unless --controllers names some"
     add("--controller", action="append", default=[], metavar="FILE.py:NAME", help=own)
-    own = "scenario of your own, in place of others"
+    own = "scenario of your own, in place of others; or a log's disturbances, FILE.csv (identify --series)"
     add("--scenario", action="append", default=[], metavar="FILE.py:NAME", help=own)
     parser.add_puller("every row runs on it, with the controllers that are designed for it")
     about = "largest deviation of the diameter that is no scrap, in the report for --puller [mm] (1)"
