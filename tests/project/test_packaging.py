@@ -111,6 +111,23 @@ def test_pins_lie_in_the_open_ranges(file):
         assert {requirement.name for requirement in requirements} == set(pins)
 
 
+def test_the_lock_holds_the_pinned_versions_with_hashes():
+    locked = tomllib.loads((ROOT / "pylock.toml").read_text())["packages"]
+    lines = (line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines()[1:])
+    pins = {plain(name): version for name, version in lines}
+    assert {each["name"]: each["version"] for each in locked if each["name"] in pins}.items() <= pins.items()
+    files = [file for each in locked for file in (*each.get("wheels", ()), *filter(None, [each.get("sdist")]))]
+    assert all(file["hashes"]["sha256"] for file in files)
+    needed = {plain(re.match(r"[\w.-]+", text)[0]) for text in PROJECT["dependencies"]}
+    assert {*needed, "torch", "distributed"} <= {each["name"] for each in locked}
+
+
+def test_actions_are_pinned_by_hash():
+    uses = re.findall(r"uses: (\S+)", "".join(file.read_text() for file in (ROOT / ".github").rglob("*.yml")))
+    assert len(uses) > 5
+    assert all(re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", each) for each in uses)
+
+
 def test_environment_and_baselines_need_neither_torch_nor_plots():
     absent = {"torch", "stable_baselines3", "sb3_contrib", "matplotlib", "onnxruntime", "onnx", "tensorboard"}
     absent |= {"control", "tqdm", "pygame", "casadi"}
