@@ -14,7 +14,7 @@ BROWSER_READY := $(VENV)/.ready-browser
 # A worker that runs out of tests takes some of the other's: files differ too much in time to be dealt out whole.
 IN_PARALLEL := --numprocesses auto --dist worksteal
 
-.PHONY: help venv lint types test test-all test-lowest test-newest test-wheel audit test-browser benchmark benchmark-full paper docs tables notebooks clean
+.PHONY: help venv lint types test test-all test-lowest test-newest test-wheel audit lock test-browser benchmark benchmark-full paper docs tables notebooks clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -73,6 +73,10 @@ audit: ## known weaknesses of the pinned packages; asks PyPI's advisories
 	$(PYTHON) -m venv build/audit
 	build/audit/bin/python -m pip install --quiet pip-audit
 	build/audit/bin/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict
+
+lock: $(TEST_READY) ## pylock.toml: the pinned versions for Linux with their hashes; asks PyPI
+	$(BIN)/uv pip compile pyproject.toml --extra test --constraint constraints.txt --python-platform linux --quiet \
+	--generate-hashes --no-header --format pylock.toml --output-file pylock.toml
 
 test-browser: $(BROWSER_READY) ## report.html in Chromium without a window; skipped where chromium or chromedriver is absent
 	$(BIN)/python -m pytest -q tests/browser

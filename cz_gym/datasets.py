@@ -6,7 +6,6 @@ true state. Datasets of different policies can therefore be joined, and seed and
 
 import argparse
 import os
-import pkgutil
 import re
 import shutil
 import sys
@@ -15,7 +14,9 @@ import warnings
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -26,18 +27,18 @@ from scipy.signal import lfilter
 
 import cz_gym
 from cz_gym.action import drives_of
-from cz_gym.config import Config, check_config, make_config
+from cz_gym.behaviour import find_policy, own_noise, reference_scores, settings_of
+from cz_gym.config import Config, make_config
 from cz_gym.errors import CzError
+from cz_gym.evaluation.processes import side_by_side
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
+from cz_gym.evaluation.rollout import informed
 from cz_gym.machine.puller import DEFAULT, PullerFile, chosen_puller, to_toml
 from cz_gym.observation import DRIVE_CHANNELS, to_measured
 from cz_gym.support.atomic_files import check_writable
 from cz_gym.support.command_line import OneLineParser, between
-from cz_gym.support.names import unknown
 from cz_gym.vector import CzVectorEnv
 
-CONTROLLERS, AGENTS = "cz_gym.baselines.registry:CONTROLLERS", "cz_gym.agents:load"
-"""Names of the objects that provide policies; imported only when needed, because this package knows no policy."""
 EPISODES, NOISE = 100, 0.2
 """Default number of episodes, and default highest level of the excitation [-]."""
 AT_ONCE = 100
@@ -45,26 +46,6 @@ AT_ONCE = 100
 STREAM = 1
 """Random stream of the excitation, separate from that of the crystal with the same seed."""
 CODE = "https://github.com/cz-gym/cz-gym"
-
-
-def find_policy(name: str, config: Config) -> Any:
-    """The controller or shipped agent of that name, made for a config; CzError lists the known names."""
-    controllers = {entry.name: entry for entry in pkgutil.resolve_name(CONTROLLERS) if not entry.privileged}
-    check_config(config)
-    if name in controllers:
-        return controllers[name].make(config)
-    load = pkgutil.resolve_name(AGENTS)
-    try:
-        settings = settings_of(load(name))
-    except ValueError as error:
-        raise CzError(unknown("policy", name, controllers, f"; or an agent: {error}")) from None
-    return load(name, replace(config, **settings))
-
-
-def settings_of(policy: Any) -> dict[str, Any]:
-    """The environment settings "observation" and "action" of a policy; by default "measured" and "direct"."""
-    settings = {"observation": "measured", "action": "direct"} | getattr(policy, "settings", {})
-    return {name: settings[name] for name in ("observation", "action")}
 
 
 def excitation(seed: int, config: Config, noise: float) -> tuple[float, npt.NDArray[np.float64]]:
@@ -80,8 +61,16 @@ def excitation(seed: int, config: Config, noise: float) -> tuple[float, npt.NDAr
 
 
 def record(policy: Any, config: Config, seeds: Sequence[int], noise: float) -> list[dict[str, Any]]:
-    """Run one episode per seed, all in one batch; the fields of Minari's ``EpisodeBuffer`` for each episode."""
-    settings, n = settings_of(policy), len(seeds)
+    """Run one episode per seed, all in one batch; the fields of Minari's ``EpisodeBuffer`` for each episode.
+
+    The policies of a tuple take turns from seed to seed.
+    """
+    if isinstance(policy, tuple):
+        turns = [[seed for seed in seeds if policy[seed % len(policy)] is each] for each in policy]
+        parts = [record(each, config, turn, noise) for each, turn in zip(policy, turns, strict=True) if turn]
+        return sorted((episode for part in parts for episode in part), key=lambda each: seeds.index(each["seed"]))
+    settings, n, noise = settings_of(policy), len(seeds), own_noise(policy, noise)
+    policy = informed(policy, config, seeds)
     drives = drives_of(settings["action"], config.control_interval, config.heater_range)
     gains, place = np.array([drives.pull, drives.heater]), list(DRIVE_CHANNELS)
     added = np.stack([excitation(seed, config, noise)[1] for seed in seeds], axis=1)
@@ -118,16 +107,21 @@ def record(policy: Any, config: Config, seeds: Sequence[int], noise: float) -> l
     ]
 
 
+def name_of(policy: str) -> str:
+    """The name of a policy: of an agent's file its own, or for "agent.onnx" its folder's, "ppo-seed1" of ppo/seed1."""
+    path = Path(policy).absolute()
+    if path.suffix != ".onnx" or path.stem != "agent":
+        return path.stem if path.suffix == ".onnx" else policy
+    folder, seed = path.parent, re.fullmatch(r"seed\d+", path.parent.name)
+    return f"{folder.parent.name}-{folder.name}" if seed else folder.name
+
+
 def place_of(name: str, scenario: str, puller: PullerFile) -> str:
     """The identifier ``cz/<scenario>/<policy>-v0`` of a dataset, with the puller before the scenario if it has a file.
 
-    An agent file has its own name, or its folder's if it is the "agent.onnx" of a training run. "_" stands for what
-    Minari does not take.
+    "_" stands for what Minari does not take.
     """
-    path = Path(name).absolute()
-    if path.suffix == ".onnx":
-        name = path.parent.name if path.stem == "agent" else path.stem
-    parts = ["cz", *([puller.name] if puller != DEFAULT else []), scenario, f"{name}-v0"]
+    parts = ["cz", *([puller.name] if puller != DEFAULT else []), scenario, f"{name_of(name)}-v0"]
     return "/".join(re.sub(r"[^-\w]+", "_", part, flags=re.ASCII) for part in parts)
 
 
@@ -148,12 +142,13 @@ def write(
     horizon: float = 10800.0,
     overwrite: bool = False,
     puller: PullerFile = DEFAULT,
+    scored: bool = False,
 ) -> Any:
     """Write a Minari dataset, whose name is :func:`place_of`, and return it.
 
-    The numbers of the puller stand in it, so ``recover_environment`` gives the same puller back. Raises CzError for
-    seeds that are not training seeds, and for a dataset that exists unless ``overwrite`` is set. Nothing is
-    left of a dataset whose writing fails or is interrupted.
+    The numbers of the puller stand in it, so ``recover_environment`` gives the same puller back. ``scored`` adds
+    :func:`reference_scores`. Raises CzError for seeds that are not training seeds, and for a dataset that exists
+    unless ``overwrite`` is set. Nothing is left of a dataset whose writing fails or is interrupted.
     """
     minari, _ = import_module("minari"), import_module("h5py")
     settings: dict[str, Any] = {"scenario": scenario, "observation": "history", "action": "direct", "horizon": horizon}
@@ -176,11 +171,16 @@ def write(
     try:
         with closing(gym.make(cz_gym.ENV_ID, **settings)) as env, warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # author and address are the user's own to give
-            facts = {"algorithm_name": name, "code_permalink": CODE, "description": f"{name} on {scenario}, excited"}
-            dataset = minari.create_dataset_from_buffers(place, begun, env, env, **facts)
+            said = name_of(name)
+            facts = {"algorithm_name": said, "code_permalink": CODE, "description": f"{said} on {scenario}, excited"}
+            scores: Any = reference_scores(replace(config, observation="measured")) if scored else {}
+            dataset = minari.create_dataset_from_buffers(place, begun, env, env, **facts, **scores)
         for first in range(AT_ONCE, len(seeds), AT_ONCE):
             dataset.update_dataset_from_buffer(buffers(first))
-        dataset.storage.update_episode_metadata([{"excitation": excitation(i, config, noise)[0]} for i in seeds])
+        turns = policy if isinstance(policy, tuple) else (policy,)
+        noises = [own_noise(turns[seed % len(turns)], noise) for seed in seeds]
+        levels = map(excitation, seeds, repeat(config), noises)
+        dataset.storage.update_episode_metadata([{"excitation": level} for level, _ in levels])
         dataset.storage.update_metadata({"cz_gym_version": cz_gym.__version__, "plant_hash": config.plant_hash})
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
@@ -192,13 +192,14 @@ def main(argv: list[str] | None = None) -> int:
     """Write datasets and print one line about each; 0 when done, 2 for bad input, 130 when interrupted."""
     about = "Write Minari datasets of policies on training crystals, with noise on their drives."
     parser = OneLineParser("cz-gym data", about)
-    add, policies = parser.add_argument, "paper,paper-tuned,lqg-at-0.02,gradient"
-    add("--policies", default=policies, metavar="NAMES", help="controllers and shipped agents (%(default)s)")
-    add("--scenarios", default="randomized,sensor-fault", metavar="NAMES", help="(%(default)s)")
+    add, about = parser.add_argument, "controllers, agents, random, operator, mixed (%(default)s)"
+    add("--policies", default="paper,lqg,mixed,operator", metavar="NAMES", help=about)
+    add("--scenarios", default="randomized", metavar="NAMES", help="(%(default)s)")
     add("--episodes", type=between(1, len(TRAINING_SEEDS)), default=EPISODES, metavar="N", help="of each (%(default)s)")
     add("--noise", type=float, default=NOISE, metavar="X", help="highest level of the excitation (%(default)s)")
     add("--out", type=Path, metavar="FOLDER", help="instead of $MINARI_DATASETS_PATH or ~/.minari/datasets")
     add("--overwrite", action="store_true", help="replace datasets that exist")
+    parser.add_cluster()
     parser.add_puller("record on it, at its control interval")
     return parser.run(_write_all, argv, "data", "the datasets named above are complete")
 
@@ -207,16 +208,26 @@ def _write_all(given: argparse.Namespace) -> None:
     if given.out is not None:
         os.environ["MINARI_DATASETS_PATH"] = str(given.out.resolve())
     puller = chosen_puller(given.puller)
-    chosen = [
-        (name, find_policy(name, make_config(scenario, puller=puller)), scenario)
+    settings: dict[str, Any] = {"overwrite": given.overwrite, "puller": puller, "scored": True}
+    tasks = [
+        (name, find_policy(name, make_config(scenario, None, "measured", action="direct", puller=puller)), scenario)
         for scenario in given.scenarios.split(",")
         for name in given.policies.split(",")
     ]
-    for each in chosen:
-        began = time.perf_counter()
-        dataset = write(*each, TRAINING_SEEDS[: given.episodes], given.noise, overwrite=given.overwrite, puller=puller)
-        said = f"{dataset.id}: {dataset.total_episodes} episodes, {dataset.total_steps:,} steps, "
-        print(f"{said}{dataset.storage.get_size():.0f} MB, {time.perf_counter() - began:.1f} s", flush=True)
+    one = partial(_write_one, datasets_root().absolute(), TRAINING_SEEDS[: given.episodes], given.noise, settings)
+    on_cluster = side_by_side(one, tasks, None, given.cluster, datasets_root().absolute())
+    for _, line in on_cluster if given.cluster else enumerate(map(one, tasks)):
+        print(line, flush=True)
+
+
+def _write_one(
+    root: Path, seeds: Sequence[int], noise: float, settings: dict[str, Any], task: tuple[str, Any, str]
+) -> str:
+    """Write the set of a policy's name, the policy and a scenario into a folder of sets; one line about it."""
+    os.environ["MINARI_DATASETS_PATH"], began = str(root), time.perf_counter()
+    dataset = write(*task, seeds, noise, **settings)
+    said = f"{dataset.id}: {dataset.total_episodes} episodes, {dataset.total_steps:,} steps, "
+    return f"{said}{dataset.storage.get_size():.0f} MB, {time.perf_counter() - began:.1f} s"
 
 
 if __name__ == "__main__":

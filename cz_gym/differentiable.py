@@ -19,7 +19,7 @@ from cz_gym.engine.batch import Batch, first_key
 from cz_gym.engine.buffers import BufferPool
 from cz_gym.engine.layout import Out
 from cz_gym.engine.tangents import ACTIONS, build_tangents, rows, smooth, work_shape
-from cz_gym.episodes.record import GRID
+from cz_gym.episodes.scenario import GRID
 from cz_gym.errors import CzError
 from cz_gym.process import scales
 

@@ -34,6 +34,7 @@ from .observation import CAMERA, CLIP, observations
 Observation = npt.NDArray[Any]
 Action = npt.NDArray[np.float32]
 _OPTIONS = ("scenario", "state")
+_PLAIN = np.float64, np.bool_, float, bool, str
 
 
 @dataclass(frozen=True)
@@ -302,12 +303,12 @@ class CzEnv(Form, gym.Env[Observation, Action]):
 
     def _info(self) -> dict[str, Any]:
         if self._everything:
-            info = Info(zip(self._names, self._signals.tolist(), strict=True))
+            info = Info(zip(self._names, self._signals, strict=True))
             info["action_clipped"] = info["action_clipped"] > 0.0
         else:
             info = Info()
             for name, row in self._lean:
-                info[name] = self._signals.item(row)
+                info[name] = self._signals[row]
             if self._signals.item(self._clipped) > 0.0:
                 info["action_clipped"] = True
         if self._named:
@@ -322,7 +323,7 @@ class Info(dict[str, Any]):
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         for value in self.values():
-            if type(value) not in (float, bool, str):
+            if type(value) not in _PLAIN:
                 return type(self)(deepcopy(dict(self), memo))
         return type(self)(self)
 

@@ -22,6 +22,7 @@ from cz_gym.config import make_config
 from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.engine.batch import Batch
 from cz_gym.env import CzEnv
+from cz_gym.evaluation.files import software
 from cz_gym.support.atomic_files import check_writable, write_files
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.processors import processors
@@ -207,7 +208,8 @@ def measure(wanted: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, A
         {"name": name, "num_envs": running[name][0].num_envs, "steps_per_s": speed} for name, speed in medians.items()
     ]
     ratios = {name: ratio(medians, *pair) for name, (*pair, _) in RATIOS.items()}
-    return {"ratios": ratios, "rows": rows, "skipped": skipped, "threads": THREADS}
+    versions = software(("gymnasium", "numpy", "numba", "stable-baselines3", "envpool", "pcgym"))
+    return {"ratios": ratios, "rows": rows, "skipped": skipped, "threads": THREADS, "software": versions}
 
 
 def ratio(speeds: Mapping[str, float], row: str, over: str) -> float | None:

@@ -1,4 +1,4 @@
-"""Training seeds side by side, each a run in its own folder, in processes of this machine."""
+"""Training seeds side by side, each a run in its own folder, in processes of this machine or on a cluster."""
 
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -8,7 +8,7 @@ from typing import Any
 from tqdm import tqdm
 
 from cz_gym.errors import CzError
-from cz_gym.evaluation.processes import in_processes
+from cz_gym.evaluation.processes import side_by_side
 from cz_gym.support.atomic_files import locked
 
 from .run import Job, Run
@@ -39,7 +39,7 @@ def _tried(train: Callable[[Job], dict[str, float]], job: Job) -> dict[str, floa
         return error
 
 
-def train_seeds(jobs: Sequence[Job], bar: Any) -> Iterator[tuple[Job, dict[str, float]]]:
+def train_seeds(jobs: Sequence[Job], bar: Any, cluster: str | None = None) -> Iterator[tuple[Job, dict[str, float]]]:
     """Train the seeds that are not finished; yields each with its summary. ``bar`` is tqdm's and counts seeds.
 
     Once the others are done, CzError names the seeds that failed; any other exception of a seed is raised as it is.
@@ -56,7 +56,8 @@ def train_seeds(jobs: Sequence[Job], bar: Any) -> Iterator[tuple[Job, dict[str, 
             yield job, summary
         else:
             missing.append(job)
-    for number, result in in_processes(partial(_tried, train_seed), missing, look):
+    shared = jobs[0].folder.parent
+    for number, result in side_by_side(partial(_tried, train_seed), missing, look, cluster, shared):
         if isinstance(result, Exception):
             failed[missing[number].seed] = result
         else:

@@ -11,7 +11,7 @@ from cz_gym.body.plant import Disturbance, Inputs, Puller, State, disturbance, m
 from cz_gym.config import Config
 from cz_gym.engine.batch import Key, first_key
 from cz_gym.episodes.draw import randomised
-from cz_gym.episodes.record import GRID
+from cz_gym.episodes.scenario import GRID
 from cz_gym.episodes.schedule import bias_offset, reference
 from cz_gym.episodes.series import draw_episode, draw_factors, new_series
 from cz_gym.physics.meniscus import MeniscusModel

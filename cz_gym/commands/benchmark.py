@@ -56,12 +56,13 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     add("--agent", type=_agent_file, action="append", default=[], metavar="[NAME=]FILE", help=agent_help)
     own = "controller of your own, beside the classical ones of README's table unless --controllers names some"
     add("--controller", action="append", default=[], metavar="FILE.py:NAME", help=own)
-    own = "scenario of your own, in place of others"
+    own = "scenario of your own, in place of others; or a log's disturbances, FILE.csv (identify --series)"
     add("--scenario", action="append", default=[], metavar="FILE.py:NAME", help=own)
     parser.add_puller("every row runs on it, with the controllers that are designed for it")
     about = "largest deviation of the diameter that is no scrap, in the report for --puller [mm] (1)"
     add("--tolerance", type=float, metavar="MM", help=about)
     add("--slow", action="store_true", help=f"slow controllers too, on 50 episodes; resumed from {shown(CACHE)}")
+    parser.add_cluster()
     add("--overwrite", action="store_true", help="replace files of earlier or other runs")
     add("--quiet", action="store_true", help="no progress bar, no table; a bar is shown on a terminal only")
     return parser.parse_args(argv)
@@ -102,7 +103,7 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
         import matplotlib  # noqa: F401
         import plotly  # noqa: F401
     bounds = None if arguments.puller else BOUNDS
-    results = run(contenders, rows, arguments.episodes, CACHE, bounds, arguments.quiet)
+    results = run(contenders, rows, arguments.episodes, CACHE, bounds, arguments.quiet, arguments.cluster)
     quoted = README if not smaller and arguments.out and arguments.out.resolve() == FOLDER else None
     write(arguments.out, arguments.json, results, command, quoted)
     if not arguments.quiet:

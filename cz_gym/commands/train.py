@@ -36,11 +36,14 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_puller("train for it, at its control interval")
     about = "run folder (default: runs/<algo>-seed<seed>; with --seeds runs/<algo>, with a folder for each seed)"
     add("--out", type=Path, help=about)
+    parser.add_cluster()
     add("--plot", action="store_true", help="draw the progress into the run folder: progress.png")
     add("--resume", action="store_true", help="continue from the run folder's checkpoint; sac with a new replay buffer")
     about = "time between checkpoints: the most that a crash loses (default: %(default)s)"
     add("--checkpoint-seconds", type=between(0, 10**6), default=60, metavar="S", help=about)
     arguments = parser.parse_args(argv)
+    if arguments.cluster and not arguments.seeds:
+        parser.error("--cluster shares --seeds FIRST-LAST between machines: a single seed is one task")
     suffix = "" if arguments.seeds else f"-seed{arguments.seed or 0}"
     puller = f"-{Path(arguments.puller).stem}" if arguments.puller else ""
     arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT}{puller}{suffix}"
@@ -87,7 +90,7 @@ def train(arguments: argparse.Namespace) -> int:
         return 0
     form = "{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
     with tqdm(total=len(jobs), bar_format=form, disable=None) as bar:
-        for job, summary in train_seeds(jobs, bar):
+        for job, summary in train_seeds(jobs, bar, arguments.cluster):
             bar.write(f"seed {job.seed}: {_summary_line(summary)}")
     print(f"wrote agent.onnx into {len(jobs)} folders of {arguments.out}")
     return 0

@@ -17,7 +17,7 @@ from cz_gym.baselines.tuning.values import file_name, folder_of
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
-from cz_gym.evaluation.processes import in_processes
+from cz_gym.evaluation.processes import side_by_side
 from cz_gym.machine.puller import PullerFile, chosen_puller
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.names import unknown
@@ -34,6 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--controller", help=f"{', '.join(TUNABLE)} (with --puller: all that are searched for one)")
     add("--scenario", default="randomized", help="scenario to tune on")
     add("--control-interval", type=float, default=5.0, help="time between actions [s]")
+    parser.add_cluster()
     parser.add_puller("design for it: a controller of its own for each row, minutes of work")
     about = "candidates to try, those of an earlier run included (100; with --puller at most 10 to 48)"
     add("--trials", type=between(1, 100_000), help=about)
@@ -45,6 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _tune(given: argparse.Namespace) -> None:
     if given.puller is not None:
         return for_puller(given, chosen_puller(given.puller))
+    if given.cluster:
+        raise CzError("--cluster shares the searches for a --puller between machines: one search is one task")
     if given.controller is None:
         raise CzError("name a --controller, or a --puller to design for")
     scenario, tuned = find_scenario(given.scenario), TUNABLE.get(given.controller)
@@ -66,7 +69,7 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
     searched = {each.name: each for each in (*LQGS, *PIDS) if each.searched_on_puller}
     if given.controller not in (None, *searched):
         raise CzError(unknown("controller to tune for a puller", given.controller, searched))
-    config, folder = crystals_on(puller), given.out or folder_of(puller)
+    config, folder = crystals_on(puller), (given.out or folder_of(puller)).absolute()
     tasks: list[Task] = []
     for each in [searched[given.controller]] if given.controller else searched.values():
         trials = given.trials or each.per_parameter * len(each.goal_on(config).parameters)
@@ -76,7 +79,7 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
         def look() -> None:
             bar.update(sum(tried(folder / f"{task[0].name}.json") for task in tasks) - bar.n)
 
-        for number, chosen in in_processes(search_for, tasks, look):
+        for number, chosen in side_by_side(search_for, tasks, look, given.cluster, folder):
             look()
             figures = chosen.facts["figures"]
             said = f"RMSE {figures['rmse_mm']:.3f} mm, {100 * figures['failure_rate']:.0f} % lost"

@@ -20,8 +20,10 @@ from cz_gym.action import drives_of
 from cz_gym.camera.image import build_look
 from cz_gym.camera.view import IMAGE, make_view
 from cz_gym.config import Config, Identity
+from cz_gym.episodes.log_series import series_table
 from cz_gym.episodes.mixture import Distribution
-from cz_gym.episodes.record import GRID, ScenarioTable, scenario_table
+from cz_gym.episodes.record import ScenarioTable, scenario_table
+from cz_gym.episodes.scenario import GRID
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import entry
 from cz_gym.machine.adapt import adapt_scenario
@@ -78,7 +80,8 @@ class Batch:
         process = config.process
         self.kernels = build_kernels(process, config.meniscus)
         points = math.ceil(config.horizon / GRID) + 1
-        self.clock = Clock(config.control_interval, config.steps, points, config.radius_limit, config.weights)
+        series = series_table(config.scenario.scenarios)
+        self.clock = Clock(config.control_interval, config.steps, points, config.radius_limit, config.weights, series)
         self.drives = drives_of(config.action, config.control_interval, *config.ranges[::-1])
         self.channels = len(observations(process)["history" if config.observation == "history" else "measured"])
         shows_state = config.observation == "state" or (everything and config.observation == "history")
@@ -169,6 +172,8 @@ class Batch:
         A puller without a finite operating point is drawn again; ValueError if none is found.
         """
         given = None if given is None else adapt_scenario(self.config.puller, given)
+        if given and any(each.series for each in (*given.scenarios, *self.config.scenario.scenarios)):
+            raise CzError("series of a log come with the environment: make it with that scenario, not its reset")
         lots = self._lots if given is None else scenario_table(given, self.config.model)
         slots = np.array(which, np.int64)
         words = np.array(list(keys), np.uint64).reshape(-1, 2)

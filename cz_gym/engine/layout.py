@@ -133,6 +133,8 @@ class Clock(NamedTuple):
     """Largest |r_c - r_ref| [m]."""
     weights: Any
     """Weights of the cost's terms, a named tuple."""
+    series: Any
+    """Load [W] and fluctuation [K] from logs, one row a scenario, shape (scenarios, points, 2); no points: none."""
 
 
 class Memory(NamedTuple):

@@ -7,8 +7,10 @@ arithmetic, so that a slot's trajectory does not depend, in any bit, on the slot
 
 from typing import Any
 
+import numpy as np
+
 from cz_gym.episodes.noise import fluctuation, next_fluctuation
-from cz_gym.episodes.record import GRID
+from cz_gym.episodes.scenario import GRID
 from cz_gym.episodes.schedule import drift
 from cz_gym.jit.compile import column, inlined, jittable, scratch, set_column, set_labelled
 from cz_gym.physics.arithmetic import rk4
@@ -23,7 +25,7 @@ _EPS = 1e-9
 
 
 @jittable
-def _disturb(slot: Any, j: Any, process: Any) -> Any:
+def _disturb(slot: Any, j: Any, series: Any, process: Any) -> Any:
     """The disturbance at grid point j, this one or the next; the hidden load is solved only while the drift moves."""
     p, e = slot.puller, slot.episode
     if j != slot.point:
@@ -33,6 +35,9 @@ def _disturb(slot: Any, j: Any, process: Any) -> Any:
     shift = drift(j * GRID, e)
     if shift != slot.drift:
         slot.drift, slot.Q_d = shift, process.hidden_load(shift, p)
+    if series.shape[1] > 0 and not np.isnan(series[slot.scenario, 0, 0]):
+        at = min(j, series.shape[1] - 1)
+        slot.Q_d, slot.dT_i = series[slot.scenario, at, 0], series[slot.scenario, at, 1]
     return process.disturb(slot.Q_d, slot.dT_i, j * GRID, e)
 
 
@@ -47,12 +52,12 @@ def _begin(slot: Any, numbers: Any, lanes: Any, lane: Any, interval: Any, model:
 
 
 @jittable
-def _prepare(slot: Any, lanes: Any, lane: Any, interval: Any, model: Any) -> None:
+def _prepare(slot: Any, lanes: Any, lane: Any, interval: Any, series: Any, model: Any) -> None:
     """Prepare the next substep, to the next point of the 5 s grid or to the end of the interval."""
     t, end = lanes[model.dt_at + 1, lane], (slot.k + 1) * interval
     j = int(t / GRID + _EPS)
     upto = min((j + 1) * GRID, end)
-    set_column(model.process.Disturbance, _disturb(slot, j, model.process), lanes, model.d_at, lane)
+    set_column(model.process.Disturbance, _disturb(slot, j, series, model.process), lanes, model.d_at, lane)
     lanes[model.dt_at, lane], lanes[model.dt_at + 1, lane] = upto - t, upto
 
 
@@ -113,7 +118,7 @@ def advance(memory: Any, active: Any, first: Any, count: Any, clock: Any, model:
     while going > 0:
         for lane in range(count):
             if lanes[goes, lane] > 0.0:
-                _prepare(memory.slots[first + lane], lanes, lane, clock.interval, model)
+                _prepare(memory.slots[first + lane], lanes, lane, clock.interval, clock.series, model)
         if slow:
             _heat(memory, first, count, lanes, clock.interval, model)
         _integrate(lanes, ends, count, model)

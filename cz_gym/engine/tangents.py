@@ -8,7 +8,7 @@ subtraction, so h can be arbitrarily small (Squire and Trapp, SIAM Review 1998).
 from functools import lru_cache
 from typing import Any
 
-from cz_gym.episodes.record import GRID
+from cz_gym.episodes.scenario import GRID
 from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import column, compiled_as, jittable, kernel, labelled, scratch, set_column
 from cz_gym.physics.arithmetic import along, plus_product, rk4

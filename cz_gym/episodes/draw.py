@@ -13,9 +13,9 @@ import numpy as np
 from cz_gym.jit.compile import jittable
 from cz_gym.physics.parameters import Parameters
 
-from .record import FREEZES, GRID, MIXTURE_STREAM, Episode, Factors, Stream, stream_number
+from .record import FREEZES, MIXTURE_STREAM, Episode, Factors, Stream, stream_number
 from .rng import WORDS, normal, seed_stream, uniform
-from .scenario import DRAW_SPAN, MAX_FLAGGED
+from .scenario import DRAW_SPAN, GRID, MAX_FLAGGED
 
 STREAMS = len(Stream)
 _NUMBERS = tuple(map(stream_number, range(STREAMS)))

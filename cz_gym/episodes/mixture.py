@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
+from pathlib import Path
 from typing import Any
 
 from cz_gym.errors import CzError
@@ -45,8 +46,9 @@ class Mixture:
 
 Distribution = Scenario | Mixture
 """What episodes are drawn from."""
-AnyScenario = str | Scenario | Mixture | Mapping[Any, float]
-"""The environment's ``scenario`` argument: a name, a scenario, or scenarios or their names with their shares."""
+AnyScenario = str | Path | Scenario | Mixture | Mapping[Any, float]
+"""The environment's ``scenario`` argument: a name, a scenario, scenarios or names with their shares, or a CSV file of
+disturbances from logs."""
 
 
 def make_mixture(shares: list[tuple[Scenario, Any]]) -> Mixture:

@@ -12,8 +12,6 @@ from .mixture import Distribution
 from .scenario import FAMILIES, MAX_FLAGGED, MAX_UNFLAGGED
 from .scenarios import mix_of
 
-GRID = 5.0
-"""Interval [s] of the grid on which physical fluctuations live; held in between."""
 FREEZES = MAX_FLAGGED + MAX_UNFLAGGED
 """Freeze windows an episode can hold; the last is the unflagged one."""
 

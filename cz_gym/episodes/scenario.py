@@ -22,6 +22,8 @@ from cz_gym.support.units import HOUR
 Range = tuple[float, float]
 NONE: Range = (0.0, 0.0)
 ONE: Range = (1.0, 1.0)
+GRID = 5.0
+"""Interval [s] of the grid on which physical fluctuations live; held in between."""
 DRAW_SPAN = 3.0 * HOUR
 """Span [s] over which "uniform over the episode" is drawn, whatever the horizon: a draw never depends on it."""
 MAX_FLAGGED, MAX_UNFLAGGED = 3, 1
@@ -199,6 +201,9 @@ class Scenario:
     sensor: Sensor = field(default_factory=Sensor)
     faults: Faults = field(default_factory=Faults)
     actuators: Actuators = field(default_factory=Actuators)
+    series: tuple[tuple[float, float], ...] = ()
+    """Heat load on the melt [W] and fluctuation of the interface [K] on the 5 s grid, in place of drawn ones; the last
+    values stay (:mod:`cz_gym.episodes.log_series`)."""
 
     def __post_init__(self) -> None:
         if not (self.name and isinstance(self.name, str)):
@@ -240,6 +245,7 @@ class Scenario:
         for family, each, value in self.members:
             if not each.metadata["member"].quantity.later or value != each.default:
                 contents.setdefault(family, {})[each.name] = _plain(each.default, value)
+        contents |= {"series": self.series} if self.series else {}
         text = json.dumps(contents, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -249,7 +255,11 @@ class Scenario:
         return not any(each.metadata["member"].draw.differs(value) for _, each, value in self.members)
 
 
-FAMILIES: dict[str, Any] = {family.name: family.default_factory for family in dataclasses.fields(Scenario)[1:]}
+FAMILIES: dict[str, Any] = {
+    each.name: each.default_factory
+    for each in dataclasses.fields(Scenario)
+    if each.default_factory is not dataclasses.MISSING
+}
 """The families of a scenario, and their classes."""
 
 

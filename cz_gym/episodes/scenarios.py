@@ -3,11 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from numbers import Real
+from pathlib import Path
 
 from cz_gym.errors import CzError
 from cz_gym.support.names import unknown
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
+from .log_series import read_series
 from .mixture import AnyScenario, Distribution, Mixture, make_mixture
 from .scenario import Actuators, Drift, Faults, Interface, Pullers, Recipe, Reference, Scenario, Sensor
 
@@ -137,7 +139,12 @@ _ROWS = {
 
 
 def find_distribution(given: AnyScenario) -> Distribution:
-    """The scenario or mixture that is meant by a name ("all" too), a scenario, a mixture, or scenarios with shares."""
+    """The scenario or mixture that is meant by a name ("all" too), a scenario, a mixture, or scenarios with shares.
+
+    A name that ends with .csv is a file of disturbances from logs.
+    """
+    if isinstance(given, str | Path) and str(given).endswith(".csv"):
+        return read_series(Path(given), RANDOMIZED.sensor)
     if isinstance(given, str) and given == "all":
         return ALL
     if isinstance(given, Mapping):
@@ -147,6 +154,8 @@ def find_distribution(given: AnyScenario) -> Distribution:
 
 def find_scenario(scenario: AnyScenario) -> Scenario:
     """Return the scenario of this name, or the given one; raise CzError if there is none, and for a mixture."""
+    if isinstance(scenario, str | Path) and str(scenario).endswith(".csv"):
+        scenario = find_distribution(scenario)
     if isinstance(scenario, Scenario):
         return scenario
     if isinstance(scenario, Mixture | Mapping) or scenario == "all":

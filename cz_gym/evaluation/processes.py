@@ -1,4 +1,4 @@
-"""One function on many tasks, through any executor; by default in several processes of this machine."""
+"""One function on many tasks, through any executor: in several processes of this machine, or on a cluster."""
 
 import os
 import signal
@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from importlib import import_module
 from multiprocessing import get_context
+from pathlib import Path
 from threading import Thread
 from typing import Any
 
@@ -51,6 +53,25 @@ def in_processes(
     finally:
         held.close()
         pool.shutdown(cancel_futures=True)
+
+
+def side_by_side(
+    function: Callable[[Any], Any],
+    tasks: Sequence[Any],
+    look: Look | None = None,
+    cluster: str | None = None,
+    shared: Path | None = None,
+    processes: int | None = None,
+) -> Iterator[tuple[int, Any]]:
+    """Run tasks as :func:`through` does, on the cluster at that address, or in processes of this machine.
+
+    ``shared`` is the folder that tasks write into.
+    """
+    if not cluster:
+        yield from in_processes(function, tasks, look, processes)
+    elif tasks:
+        on_cluster = import_module("cz_gym.evaluation.cluster").on_cluster
+        yield from on_cluster(cluster, function, tasks, look, shared)
 
 
 @contextmanager

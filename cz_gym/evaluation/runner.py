@@ -10,7 +10,7 @@ from cz_gym.evaluation.contender import Contender
 from cz_gym.support.processors import processors
 
 from .cache import SlowEpisodes, earlier_bound
-from .processes import in_processes
+from .processes import side_by_side
 from .protocol import SLOW_EPISODES, Row
 from .results import Result, Sample, summarise
 from .rollout import check_policy, rollout
@@ -86,24 +86,26 @@ def run(
     cache: Path,
     bounds: Path | None = None,
     quiet: bool = False,
+    cluster: str | None = None,
 ) -> list[Result]:
     """Roll every contender out on every row, with a progress bar unless ``quiet``, and summarise.
 
     ``cache`` is the folder of slow controllers' episodes, ``bounds`` that of an earlier benchmark whose bound serves a
-    run without one. A long run is shared between processes.
+    run without one. A long run is shared between processes, any run between the workers of a ``cluster``.
     """
     from tqdm import tqdm
 
-    tasks = [Task(each, row, episodes, cache) for row in rows for each in contenders]
+    tasks = [Task(each, row, episodes, cache.absolute()) for row in rows for each in contenders]
     total = sum(task.steps for task in tasks)
     # The first task compiles for all.
-    alone = 1 if total > LONG else len(tasks)
+    alone = 0 if cluster else 1 if total > LONG else len(tasks)
     samples: dict[int, Sample] = {}
     with tqdm(total=total, unit="step", unit_scale=True, leave=False, disable=quiet or None) as bar:
         for number, task in enumerate(tasks[:alone]):
             bar.set_description(f"{task.row.name}, {task.contender.name}")
             samples[number] = measure(task, bar.update)
-        for place, sample in in_processes(measure, tasks[alone:], processes=min(processors(), PROCESSES)):
+        workers = min(processors(), PROCESSES)
+        for place, sample in side_by_side(measure, tasks[alone:], cluster=cluster, processes=workers):
             samples[alone + place] = replace(sample, contender=tasks[alone + place].contender)
             bar.update(tasks[alone + place].steps)
     results = []

@@ -11,7 +11,7 @@ from typing import Any, Self
 from cz_gym.config import Config
 from cz_gym.episodes.mixture import Distribution
 from cz_gym.episodes.scenario import Scenario
-from cz_gym.episodes.scenarios import SCENARIOS, find_distribution
+from cz_gym.episodes.scenarios import SCENARIOS, find_distribution, find_scenario
 from cz_gym.errors import CzError
 from cz_gym.evaluation.contender import Contender
 from cz_gym.support.names import unknown
@@ -110,7 +110,10 @@ def _controls(value: Any, module: str) -> bool:
 
 
 def row(place: str) -> Row:
-    """Return a row of the scenario at ``FILE.py:NAME``, a :class:`cz_gym.Scenario`, on the default puller."""
+    """Return a row of the scenario at ``FILE.py:NAME``, a :class:`cz_gym.Scenario`, or of a log's series, FILE.csv."""
+    if place.endswith(".csv"):
+        scenario = find_scenario(place)
+        return Row(scenario.name, scenario, f"of {place}", default=False, file=place)
     _, scenario = load(place, "scenario", lambda value, _: isinstance(value, Scenario) and value.name not in SCENARIOS)
     if not isinstance(scenario, Scenario):
         raise CzError(f"{place}: no scenario: a {type(scenario).__name__}, not a cz_gym.Scenario")

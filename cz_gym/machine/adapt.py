@@ -50,7 +50,7 @@ def adapt_scenario(puller: PullerFile, distribution: Distribution) -> Distributi
         stated = _stated(puller, quantity)
         numbers[family][each.name] = scaled if stated is None else stated
     families: dict[str, Any] = {family: kind(**numbers[family]) for family, kind in FAMILIES.items()}
-    return ScenarioOn(distribution.name, puller=puller.hash, **families)
+    return ScenarioOn(distribution.name, puller=puller.hash, series=distribution.series, **families)
 
 
 def _proportion(puller: PullerFile, unit: str) -> float:

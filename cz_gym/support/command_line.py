@@ -12,9 +12,9 @@ from gymnasium.error import DependencyNotInstalled
 from cz_gym.errors import CzError
 
 OPTIONAL = (
-    "aiohttp", "array_api_compat", "asyncua", "blark", "casadi", "control", "envpool", "filelock", "fmpy", "h5py",
-    "matplotlib", "minari", "onnx", "onnxruntime", "pandas", "pcgym", "plotly", "pyarrow", "pygame", "pythonfmu",
-    "sb3_contrib", "selenium", "stable_baselines3", "tensorboard", "torch", "tqdm",
+    "aiohttp", "array_api_compat", "asyncua", "blark", "casadi", "control", "distributed", "envpool", "filelock",
+    "fmpy", "h5py", "matplotlib", "minari", "onnx", "onnxruntime", "pandas", "pcgym", "plotly", "pyarrow", "pygame",
+    "pythonfmu", "sb3_contrib", "selenium", "stable_baselines3", "tensorboard", "torch", "tqdm",
 )  # fmt: skip
 """Modules of the packages in the extras of ``pyproject.toml``."""
 
@@ -33,6 +33,13 @@ class OneLineParser(argparse.ArgumentParser):
         """Add the option ``--puller``."""
         about = f"puller file, or the name of a shipped one: {use} (docs/extend/puller.md)"
         self.add_argument("--puller", metavar="FILE.toml", help=about)
+
+    def add_cluster(self) -> None:
+        """Add the option ``--cluster``."""
+        about = (
+            "Dask scheduler whose workers run the tasks, tcp://HOST:8786, in place of this machine (docs/cluster.md)"
+        )
+        self.add_argument("--cluster", metavar="ADDRESS", help=about)
 
     def run(
         self,

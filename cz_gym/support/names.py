@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from typing import Any
 
-from cz_gym.errors import CzError
+from cz_gym.errors import CzError, UnexpectedKeyword
 
 
 def needs(kind: type, value: Any, how: str) -> Any:
@@ -25,9 +25,9 @@ def unknown(kind: str, name: object, known: Iterable[str], also: str = "") -> st
 
 
 def known_keywords(given: Iterable[str], *functions: Callable[..., Any]) -> None:
-    """Raise CzError for the first keyword that none of the functions has."""
+    """Raise UnexpectedKeyword for the first keyword that none of the functions has."""
     parameters = [each for function in functions for each in inspect.signature(function).parameters.values()]
     known = dict.fromkeys(each.name for each in parameters if each.name != "self" and each.kind != each.VAR_KEYWORD)
     for name in given:
         if name not in known:
-            raise CzError(unknown("keyword", name, known))
+            raise UnexpectedKeyword(unknown("keyword argument", name, known).replace("unknown", "unexpected", 1))

@@ -217,8 +217,8 @@ def test_usual_layers_act_alike_in_torch_in_the_file_and_in_its_export(layer, tm
     policy = PPO("MlpPolicy", "Cz-v0", seed=0, device="cpu", n_steps=8, batch_size=8, policy_kwargs=arch).policy
     with torch.no_grad():
         policy.action_net.weight *= 30.0
-    seen = np.random.default_rng(0).normal(0.0, 2.0, (50, 72)).astype(np.float32)
-    content = to_onnx(policy, 72)
+    seen = np.random.default_rng(0).normal(0.0, 2.0, (50, len(HISTORY))).astype(np.float32)
+    content = to_onnx(policy, len(HISTORY))
     agent = OnnxPolicy.of(make_contract(content, **facts()), content)
     wanted = policy.predict(seen, deterministic=True)[0]
     assert np.abs(wanted).max() > 0.2

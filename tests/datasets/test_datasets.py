@@ -4,14 +4,16 @@ import minari
 import numpy as np
 import pytest
 
-from cz_gym import datasets
+from cz_gym import behaviour, datasets
 from cz_gym.baselines import CompensatedPID
+from cz_gym.behaviour import find_policy, settings_of
 from cz_gym.config import make_config
-from cz_gym.datasets import excitation, find_policy, main, place_of, record, settings_of, write
+from cz_gym.datasets import excitation, main, place_of, record, write
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.replay import Playback
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.machine.puller import DEFAULT, find_puller
+from cz_gym.observation import DRIVE_CHANNELS
 
 CONFIG = make_config("randomized", action="direct", horizon=1200.0)
 
@@ -19,6 +21,7 @@ CONFIG = make_config("randomized", action="direct", horizon=1200.0)
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "data"))
+    monkeypatch.setattr(behaviour, "VALIDATION_SEEDS", VALIDATION_SEEDS[:1])  # of the scores: 100 take 16 s
     return tmp_path / "data"
 
 
@@ -63,11 +66,38 @@ def test_a_set_of_another_puller_gives_that_puller_back(place):
     [
         ("lqg-at-0.02", "cz/hard/lqg-at-0_02-v0"),
         ("runs/mine/agent.onnx", "cz/hard/mine-v0"),
+        ("runs/ppo/seed3/agent.onnx", "cz/hard/ppo-seed3-v0"),
         ("runs/mine/größte ppo.onnx", "cz/hard/gr_te_ppo-v0"),
     ],
 )
 def test_names_are_what_minari_takes(name, expected):
     assert place_of(name, "hard", DEFAULT) == expected
+
+
+@pytest.mark.slow
+def test_named_sets_have_failures_and_scores_and_the_same_bytes_twice(tmp_path, place):
+    command = ["--policies", "random,mixed,operator", "--episodes", "4", "--out"]
+    bytes_of = []
+    for folder in (tmp_path / "one", tmp_path / "two"):
+        assert main([*command, str(folder)]) == 0
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+        bytes_of.append([(str(path.relative_to(folder)), path.read_bytes()) for path in files])
+    assert bytes_of[0] == bytes_of[1]
+    assert len(bytes_of[0]) == 8, "of each set two files, and one of each of the two folders above them"
+    sets = {name: minari.load_dataset(f"cz/randomized/{name}-v0") for name in ("random", "mixed", "operator")}
+    ends = {name: [each.terminations[-1] for each in some.iterate_episodes()] for name, some in sets.items()}
+    assert all(ends["random"])
+    assert not any(ends["operator"])
+    assert list(ends["mixed"][:2]) == [False, False]
+    assert ends["mixed"][3]
+    again(sets["mixed"], 3)
+    drives = next(iter(sets["operator"].iterate_episodes())).observations[:, list(DRIVE_CHANNELS)]
+    assert len(np.unique(np.sign(np.diff(drives[:24, 0])))) > 1
+    scores = sets["mixed"].storage.metadata
+    low, high = scores["ref_min_score"], scores["ref_max_score"]
+    np.testing.assert_allclose(minari.get_normalized_score(sets["mixed"], np.array([low, high])), [0.0, 1.0])
+    facts = sets["mixed"].storage.get_episode_metadata(range(4))
+    assert [each["excitation"] > 0.0 for each in facts] == [True, True, True, False]
 
 
 def test_without_a_home_a_folder_is_asked_for(monkeypatch, refused):

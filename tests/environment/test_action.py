@@ -59,7 +59,10 @@ def test_info_is_lean_unless_all_is_asked_for():
         assert set(info) == keys
         *_, info = env.step(np.array([1.5, 0.5], np.float32))
         assert set(info) == keys | {"action_clipped"}
-        assert info["action_clipped"] is True
+        assert info["action_clipped"]
+        assert {type(value) for value in info.values()} <= {np.float64, np.bool_, bool, np.ndarray}, (
+            "TorchRL reads dtypes"
+        )
 
 
 def test_a_deep_copy_of_info_shares_nothing():

@@ -51,7 +51,7 @@ def test_everything_advertised_is_there():
         ({"parameters": {"sigma": 1.0}}, r"cz_gym\.Parameters"),
         ({"parameters": Parameters(k_l=math.nan)}, "parameter k_l = nan"),
         ({"meniscus": "hurle"}, r"cz_gym\.MeniscusModel"),
-        ({"scenaro": "hard"}, "unknown keyword .scenaro.: did you mean .scenario.[?]"),
+        ({"scenaro": "hard"}, "unexpected keyword argument .scenaro.: did you mean .scenario.[?]"),
         ({"action": "rough"}, "unknown action 'rough'; choose from direct, smooth, rate"),
         ({"info": "everything"}, "info must be one of lean, all, not 'everything'"),
         ({"parameters": Parameters(alpha_0=1.5)}, "nominal meniscus height .* check r_0, alpha_0"),
@@ -123,7 +123,7 @@ def test_out_of_range_actions_are_clipped_and_said_so():
         env = CzEnv(info="all", **PLAIN)
         env.reset(seed=0)
         observation, *_, info = env.step(np.array(action))
-        assert info["action_clipped"] is clipped
+        assert info["action_clipped"] == clipped
         runs.append((observation.tolist(), info["v_p"], info["Q_H"]))
     assert runs[0] == runs[1]
 

@@ -38,7 +38,7 @@ def of(run):
 
 def test_metrics_of_a_perfect_crystal_are_perfect():
     perfect = of(made_up(720))
-    assert perfect == Metrics(0, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0)
+    assert perfect == Metrics(0, 0, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0)
 
 
 def test_mean_square_error_is_against_the_reference_as_it_moves():
@@ -130,7 +130,9 @@ def test_return_charges_a_lost_crystal_for_what_is_left_and_nothing_else_reads_r
     run.reward[:] = np.arange(10.0)[:, None]
     rewarded, still = of(run), of(made_up(10, lived=4, r_c=R + 1e-4))
     assert (rewarded.return_, still.return_) == (0 + 1 + 2 + 3 - 9 * 6, -9 * 6)
-    assert rewarded._replace(return_=0.0) == still._replace(return_=0.0)
+    assert np.isnan(rewarded.rmse_survivors_mm)
+    same = {"return_": 0.0, "rmse_survivors_mm": 0.0}
+    assert rewarded._replace(**same) == still._replace(**same)
 
 
 @given(st.floats(0.0, 1e12), st.integers(2, 5000))

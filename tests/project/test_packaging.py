@@ -1,12 +1,15 @@
 """Installation: one package with four dependencies, by every way of installing it."""
 
+import importlib
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tarfile
 import tomllib
 import zipfile
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -108,6 +111,23 @@ def test_pins_lie_in_the_open_ranges(file):
         assert {requirement.name for requirement in requirements} == set(pins)
 
 
+def test_the_lock_holds_the_pinned_versions_with_hashes():
+    locked = tomllib.loads((ROOT / "pylock.toml").read_text())["packages"]
+    lines = (line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines()[1:])
+    pins = {plain(name): version for name, version in lines}
+    assert {each["name"]: each["version"] for each in locked if each["name"] in pins}.items() <= pins.items()
+    files = [file for each in locked for file in (*each.get("wheels", ()), *filter(None, [each.get("sdist")]))]
+    assert all(file["hashes"]["sha256"] for file in files)
+    needed = {plain(re.match(r"[\w.-]+", text)[0]) for text in PROJECT["dependencies"]}
+    assert {*needed, "torch", "distributed"} <= {each["name"] for each in locked}
+
+
+def test_actions_are_pinned_by_hash():
+    uses = re.findall(r"uses: (\S+)", "".join(file.read_text() for file in (ROOT / ".github").rglob("*.yml")))
+    assert len(uses) > 5
+    assert all(re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", each) for each in uses)
+
+
 def test_environment_and_baselines_need_neither_torch_nor_plots():
     absent = {"torch", "stable_baselines3", "sb3_contrib", "matplotlib", "onnxruntime", "onnx", "tensorboard"}
     absent |= {"control", "tqdm", "pygame", "casadi"}
@@ -121,6 +141,45 @@ def test_outside_the_virtual_environment_one_line_says_so(command):
     assert done.returncode != 0
     assert "gymnasium is missing: run .venv/bin/python" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def brought(requirements, extras=(), found=()):
+    """Names of the packages that pip installs for requirements, with all that they require themselves."""
+    found = set(found)
+    for each in map(importlib.import_module("packaging.requirements").Requirement, requirements):
+        if each.marker and not any(each.marker.evaluate({"extra": extra}) for extra in ("", *extras)):
+            continue
+        if (name := plain(each.name)) not in found or each.extras:
+            found |= brought(metadata.requires(name) or [], each.extras, found | {name})
+    return found
+
+
+def plain(name):
+    return re.sub("[-_.]+", "-", name).lower()
+
+
+USES = {
+    "benchmark": "run('benchmark --controllers paper --scenarios nominal --episodes 1 --quiet --out', out)",
+    "agents": "import cz_gym.agents.training.fleet, cz_gym.agents.apg, cz_gym.agents.export, cz_gym.agents.asymmetric",
+    "render": "import gymnasium; e = gymnasium.make('cz_gym:Cz-v0', render_mode='rgb_array'); e.reset(); e.render()",
+    "mpc": "from cz_gym.baselines import mpc, registry as r; import cz_gym.config as c; r.find_controller('ekf-mpc')",
+    "data": "run('data --policies paper --scenarios nominal --episodes 1 --out', out)",
+    "plant": "import cz_gym.machine.serve.__main__; run('export --plant --to fmu --out', out)",
+}
+"""What a user of each extra does with it."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("extra", USES)
+def test_an_extra_alone_brings_all_that_its_use_needs(extra, tmp_path):
+    """Minari imports Pillow and does not require it: it was there because matplotlib was."""
+    pytest.importorskip("packaging.requirements")
+    names = brought([*PROJECT["dependencies"], *PROJECT["optional-dependencies"][extra]])
+    owners = metadata.packages_distributions().items()
+    absent = {module for module, of in owners if not {"cz-gym", "setuptools", *names} & set(map(plain, of))}
+    run = "def run(words, out):\n    assert main([*words.split(), out]) == 0\n"
+    code = f"from cz_gym_command import main\n{run}out = {str(tmp_path / 'out')!r}\n{USES[extra]}"
+    python("-c", ABSENT.replace("{absent}", repr(absent)) + code, cwd=ROOT)
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from cz_gym.episodes.log_series import to_csv
 from cz_gym.errors import CzError
 from cz_gym.machine.puller import find_puller, to_toml
 from cz_gym.support.atomic_files import check_writable, write_files
@@ -25,6 +26,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("log", type=Path, nargs="+", help=f"CSV or Parquet file of one machine, with the columns {', '.join(COLUMNS)}")
     add("--puller", default="default", help="puller file to start from (default: %(default)s)")
     add("--out", type=Path, required=True, help="puller file to write; its report stands beside it")
+    about = "write the load on the melt and the fluctuations of the log too, as a scenario: scenario='FILE.csv'"
+    add("--series", type=Path, metavar="FILE.csv", help=about)
     named = "NAME=COLUMN[:UNIT]"
     add("--column", action="append", default=[], metavar=named, help="a column with another name or unit")
     add("--columns", type=Path, metavar="FILE", help='TOML file with lines NAME = "COLUMN:UNIT"')
@@ -36,8 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(given: argparse.Namespace) -> int:
     from .report import report
 
-    if given.out.suffix != ".toml":
-        raise CzError(f"--out must be a file NAME.toml, not {given.out}")
+    for option, path, suffix in (("--out", given.out, ".toml"), ("--series", given.series, ".csv")):
+        if path is not None and path.suffix != suffix:
+            raise CzError(f"{option} must be a file NAME{suffix}, not {path}")
     start = find_puller(given.puller)
     logs = [read_log(path, column_map(given.column, given.columns)) for path in given.log]
     for path, log in zip(given.log, logs, strict=True):
@@ -47,6 +51,7 @@ def _main(given: argparse.Namespace) -> int:
     page, files = given.out.with_suffix(".md"), dict[Path, bytes]()
     if given.force or not found.misfits:
         files[given.out] = to_toml(found.puller).encode()
+        files |= {given.series: to_csv(found.series()).encode()} if given.series else {}
     print(found.verdict)
     write_files(report(found, logs, ", ".join(path.name for path in given.log), page) | files)
     for e in found.estimates:

@@ -15,7 +15,7 @@ from cz_gym.physics.parameters import Parameters
 from cz_gym.support.names import unknown
 
 from .grid import Floats, Log, join, prepare, shift_drives
-from .model import LAM, Lags, Model, Noise, Predicted, sensitivities
+from .model import FAST, LAM, LOAD, SLOW, Lags, Model, Noise, Predicted, sensitivities, smooth
 from .moves import measure_excitation
 from .verdict import misfits
 
@@ -79,12 +79,31 @@ class Identified:
     errors: Floats
     """Prediction errors of pyrometer and ring in their standard deviations, shape (rows, 2); NaN without a reading."""
     predicted: Predicted
-    log: Log
-    """The logs one after the other, in the rows that were estimated from."""
+    logs: tuple[Log, ...]
+    """The logs in the rows that were estimated from."""
     settled: bool
     """Whether the search has ended at a maximum."""
     misfits: tuple[str, ...] = ()
     """Why the model does not fit the log, in words; empty if it does."""
+
+    @property
+    def log(self) -> Log:
+        """The logs one after the other."""
+        return join(self.logs)
+
+    def series(self, meniscus: MeniscusModel = HURLE) -> list[tuple[Floats, Floats, Floats]]:
+        """Of each log its times [s], the load on the melt [W] and the fluctuation of the interface [K].
+
+        They are those that a smoother gives for :attr:`puller`, so that its crystal grows as the log's did.
+        """
+        lags = _lags_of(self.puller, False)
+        model = Model(Noise._fields, self.puller.parameters, meniscus, lags)
+        theta = np.array([np.log(each.value / each.prior) for each in self.noise])
+        states = [smooth(log, model, theta) for log in self.logs]
+        return [
+            (log.time - log.time[0], each[:, LOAD], each[:, FAST] + each[:, SLOW])
+            for log, each in zip(self.logs, states, strict=True)
+        ]
 
     @property
     def puller(self) -> PullerFile:
@@ -152,7 +171,7 @@ def identify(
     read = np.isfinite([whole.T_1, whole.ring]).T
     errors = np.where(read, found.out.error / np.sqrt(found.out.variance), np.nan)
     told, noise = tuple(map(estimate, (*HEATER, *LAGS, *PULL))), tuple(map(estimate, Noise._fields))
-    result = Identified(start, told, noise, (pull, heater), errors, found.out, whole, found.settled)
+    result = Identified(start, told, noise, (pull, heater), errors, found.out, tuple(rows), found.settled)
     reasons = misfits(
         result, model.puller(found.theta + 0j), dict(zip(model.names, (found.theta - model.mean) / sd, strict=True))
     )

@@ -86,6 +86,10 @@ class Predicted(NamedTuple):
     variance: Any
     state: Any
     """Estimated states after each row, shape (rows, 12)."""
+    before: Any
+    """The states that were expected before each row."""
+    covariance: Any
+    """Covariance of the estimates, shape (rows, 12, 12)."""
 
 
 @lru_cache(maxsize=4)
@@ -95,7 +99,8 @@ def build_filter(meniscus: MeniscusModel) -> Any:
 
     def run(
         p: Any, A: Any, Q: Any, z: Any, start: Any, R: Any, read: Any, drives: Any, unsure: Any, gap: Any, slow: Any,
-        dt: Any, parts: Any, lowest: Any, highest: Any, error: Any, variance: Any, states: Any,
+        dt: Any, parts: Any, lowest: Any, highest: Any, error: Any, variance: Any, states: Any, expected: Any,
+        covariance: Any,
     ) -> None:  # fmt: skip
         P, A_t = start, np.ascontiguousarray(A.T)
         for k in range(read.shape[0]):
@@ -111,25 +116,26 @@ def build_filter(meniscus: MeniscusModel) -> Any:
                 P = start.copy() if gap[k] else A @ P @ A_t + Q
                 P[1, 1] += (dt * unsure[k, 0]) ** 2
                 P[2, 2] += (dt * unsure[k, 1] / p.C_1) ** 2
+            expected[k] = z
             for sensor in range(2):
                 error[k, sensor], variance[k, sensor] = 0.0, 1.0
                 if np.isnan(read[k, sensor]):
                     continue
                 H = np.zeros_like(z)
                 if sensor == 0:
-                    H[11], H[9], expected = 1.0, 1.0, z[11] + z[9]
+                    H[11], H[9], reads = 1.0, 1.0, z[11] + z[9]
                 else:
                     near, far = _SHARE * z[0], _SHARE * z[1]
                     H[0] = 1.0 + (ring_offset(z[0] + near, z[1], p) - ring_offset(z[0] - near, z[1], p)) / (2.0 * near)
                     H[1] = (ring_offset(z[0], z[1] + far, p) - ring_offset(z[0], z[1] - far, p)) / (2.0 * far)
-                    H[10], expected = 1.0, z[0] + ring_offset(z[0], z[1], p) + z[10]
+                    H[10], reads = 1.0, z[0] + ring_offset(z[0], z[1], p) + z[10]
                 PH = P @ H
-                error[k, sensor], variance[k, sensor] = read[k, sensor] - expected, (H * PH).sum() + R[sensor]
+                error[k, sensor], variance[k, sensor] = read[k, sensor] - reads, (H * PH).sum() + R[sensor]
                 z = z + PH * (error[k, sensor] / variance[k, sensor])
                 P = P - np.outer(PH, PH / variance[k, sensor])
             if not lowest < z[1].real < highest:
                 z[1] = min(max(z[1].real, lowest), highest)
-            states[k] = z
+            states[k], covariance[k] = z, P
 
     return kernel(run, keep=hashed(*meniscus.functions))
 
@@ -187,10 +193,9 @@ class Model(NamedTuple):
 def predict(log: Log, model: Model, theta: Any) -> Predicted:
     """Run the filter of the free numbers ``theta``, shape (names,), real or complex, over a log."""
     p, noise, meniscus = model.puller(np.asarray(theta, np.complex128)), model.noises(theta), model.meniscus
-    through = p.Q_H_0 - p.G_1a * (p.T_1_0 - p.T_a)
-    delays = model.delays(theta)
+    through, delays = p.Q_H_0 - p.G_1a * (p.T_1_0 - p.T_a), model.delays(theta)
     slow = np.complex128(delays.pyrometer_filter + QUICKEST)
-    A, Q = _sampled(p, noise, through, slow, log.interval, meniscus)
+    A, Q = _sampled(p, noise, slow, log.interval, meniscus)
     z, P = np.zeros(len(STATES), np.complex128), np.zeros((len(STATES),) * 2, np.complex128)
     z[:5] = p.state_0
     known = np.isfinite(log.r_ref).all()
@@ -204,8 +209,8 @@ def predict(log: Log, model: Model, theta: Any) -> Predicted:
     P = P + np.outer(drift, drift)
     z[SHOWN], P[SHOWN], P[:, SHOWN] = z[2], P[2], P[:, 2]
     P[SHOWN, SHOWN] = P[2, 2]
-    rows, parts = len(log.time), math.ceil(log.interval / LONGEST_STEP - 1e-9)
-    out = Predicted(*(np.zeros((rows, width), np.complex128) for width in (2, 2, len(STATES))))
+    rows, parts, n = len(log.time), math.ceil(log.interval / LONGEST_STEP - 1e-9), len(STATES)
+    out = Predicted(*(np.zeros((rows, *shape), np.complex128) for shape in ((2,), (2,), (n,), (n,), (n, n))))
     R = np.array([noise.pyrometer_sd**2, noise.camera_sd**2], np.complex128) / log.mean_of + np.square(FLOOR)
     read, drives = np.stack([log.T_1, log.ring], axis=1), np.stack([log.v_p, heating(log, delays)], axis=1)
     limits = HEIGHT_MIN, HEIGHT_MAX_IN_A * float(p.a.real)
@@ -230,11 +235,9 @@ def heating(log: Log, delays: Lags) -> Numbers:
     return heats
 
 
-def _sampled(
-    p: Any, noise: Noise, through: Any, slow: Any, dt: float, meniscus: MeniscusModel
-) -> tuple[Numbers, Numbers]:
+def _sampled(p: Any, noise: Noise, slow: Any, dt: float, meniscus: MeniscusModel) -> tuple[Numbers, Numbers]:
     """Transition over dt [s] at the operating point, and the covariance of the disturbances in it (Van Loan 1978)."""
-    n = len(STATES)
+    n, through = len(STATES), p.Q_H_0 - p.G_1a * (p.T_1_0 - p.T_a)
     F, Q = np.zeros((n, n), np.complex128), np.zeros((n, n), np.complex128)
     point = np.array([*p.state_0, 0.0, 0.0], np.complex128)
     size = np.array([*p.state_0, p.Q_H_0, 1.0])
@@ -264,3 +267,24 @@ def sensitivities(log: Log, model: Model, theta: Floats) -> tuple[Predicted, Flo
     runs = [predict(log, model, theta + 1j * _STEP * unit) for unit in np.eye(len(theta))]
     errors, variances = (np.stack([run[part].imag for run in runs]) / _STEP for part in (0, 1))
     return Predicted(*(np.ascontiguousarray(part.real) for part in runs[0])), errors, variances
+
+
+def smooth(log: Log, model: Model, theta: Floats) -> Floats:
+    """States at each row that the whole log tells, shape (rows, 12); Rauch, Tung and Striebel (1965).
+
+    The smoother begins anew, as the filter does, at a long gap.
+    """
+    out = Predicted(*(part.real for part in predict(log, model, theta)))
+    slow = np.complex128(model.delays(theta).pyrometer_filter + QUICKEST)
+    p, noise = model.puller(np.asarray(theta, np.complex128)), model.noises(theta)
+    A, Q = (part.real for part in _sampled(p, noise, slow, log.interval, model.meniscus))
+    states: Floats = out.state.copy()
+    for k in reversed(range(len(states) - 1)):
+        if log.gap[k + 1]:
+            continue
+        ahead = A @ out.covariance[k] @ A.T + Q
+        ahead[[1, 2], [1, 2]] += (log.interval * log.unsure[k + 1] / (1.0, p.C_1.real)) ** 2
+        sd = np.sqrt(np.diag(ahead))
+        inverse = np.linalg.pinv(ahead / np.outer(sd, sd), hermitian=True) / np.outer(sd, sd)
+        states[k] += out.covariance[k] @ A.T @ inverse @ (states[k + 1] - out.before[k + 1])
+    return states

@@ -17,7 +17,7 @@ from tests.contracts import facts
 @pytest.fixture
 def agent(ppo, tmp_path):
     path = tmp_path / "agent.onnx"
-    write_agent(path, to_onnx(ppo.policy, 72), **facts())
+    write_agent(path, to_onnx(ppo.policy, len(HISTORY)), **facts())
     return path
 
 
@@ -33,10 +33,10 @@ def test_one_observation_and_a_batch_of_one_act_alike(agent):
     ("change", "message"),
     [
         ({"observation": "camera"}, "does not have"),
-        ({"channels": 71}, "reads 71 channels"),
-        ({"channels": "72"}, "must be int"),
+        ({"channels": 72}, "reads 72 channels"),
+        ({"channels": "73"}, "must be int"),
         ({"format": "zip"}, "not a cz-gym-agent contract"),
-        ({"format_version": 1}, "format version 1, this release reads 5"),
+        ({"format_version": 1}, "format version 1, this release reads 6"),
         ({"sha256": "0" * 64}, "SHA-256 differs"),
         ({"surprise": 1}, "'surprise' is unknown"),
         ({"algorithm": "mine | yours"}, r"must be printable text of 1 to 160 characters without \|"),

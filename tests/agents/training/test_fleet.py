@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("few_crystals")
 SMALL_PPO = replace(QUICK, steps=4096, control_interval=30.0)
 
 
-def in_turn(function, tasks, look):
+def in_turn(function, tasks, look, *cluster):
     for number, task in enumerate(tasks):
         yield number, function(task)
         look()
@@ -33,7 +33,7 @@ def trained(monkeypatch):
         return train_small_seed(job, bar)
 
     monkeypatch.setattr(fleet, "train_seed", counted)
-    monkeypatch.setattr(fleet, "in_processes", in_turn)
+    monkeypatch.setattr(fleet, "side_by_side", in_turn)
     monkeypatch.setattr(validation, "references", lambda *_: REFERENCES)
     monkeypatch.setitem(RECIPES, "ppo", SMALL_PPO)
     return seeds
@@ -119,5 +119,5 @@ def test_processes_train_the_same(tmp_path, monkeypatch):
         with tqdm(total=3, file=io.StringIO()) as bar:
             assert {job.seed for job, _ in fleet.train_seeds(jobs, bar)} == {0, 1, 2}
             assert bar.n == pytest.approx(3)
-        monkeypatch.setattr(fleet, "in_processes", in_turn)
+        monkeypatch.setattr(fleet, "side_by_side", in_turn)
     assert agents(tmp_path / "there") == agents(tmp_path / "here")

@@ -42,7 +42,7 @@ def test_each_filter_has_the_noise_of_its_own_crystal():
         np.testing.assert_allclose(known[slot], plant_model(puller, noise, config.control_interval).Q, rtol=1e-12)
 
 
-@pytest.mark.parametrize("names", [("lqg-quiet", "lqg-quiet-privileged"), ("lqg", "full-information")])
+@pytest.mark.parametrize("names", [("lqg-at-0.02", "lqg-at-0.02-privileged"), ("lqg", "full-information")])
 def test_knowing_more_lowers_error_and_activity_on_the_same_episodes(names):
     """The puller and its fluctuations, or the whole state."""
     found = []

@@ -1,7 +1,6 @@
 """The adaptive LQG: with one hypothesis it is the LQG; with many it finds out how strong fluctuations are."""
 
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 import pytest
@@ -62,13 +61,11 @@ def test_the_adaptive_lqg_estimates_how_strong_the_fluctuations_are(strength, fa
     assert (np.abs(expected - factor) < 0.4).mean() >= 0.9
 
 
-def test_every_filter_of_the_adaptive_lqg_holds_the_slowest_hot_zones():
-    """Two of 500 validation crystals, on which a filter that expects stronger slow fluctuations would be unstable."""
-    pullers = pullers_of(make_config("hot-zone", **PLAIN), (1_000_102, 1_000_275))
-    plain = make_controller("lqg-at-0.02", make_config("hot-zone", **PLAIN))
-    hypotheses = adaptive(plain).hypotheses
-    strongest = 2.0 * plain.design.noise.slow_sd
-    for fast, slow in product(hypotheses.fast_sd, (*hypotheses.slow_sd, strongest)):
-        noise = replace(plain.design.noise, fast_sd=fast, slow_sd=slow)
-        form = linear_form(replace(plain, design=replace(plain.design, noise=noise)))
-        assert {close(form.controller, puller, form.dt).stable for puller in pullers} == {slow < strongest}
+def test_the_adaptive_lqg_holds_the_slowest_hot_zones():
+    """Two of 500 validation crystals, on which a filter that expects stronger slow fluctuations is unstable."""
+    config = make_config("hot-zone", **PLAIN)
+    plain, seeds = make_controller("lqg-at-0.02", config), (1_000_102, 1_000_275)
+    assert not rollout(adaptive(plain).for_config(config), config, seeds).failed.any()
+    noise = replace(plain.design.noise, slow_sd=2.0 * plain.design.noise.slow_sd)
+    form = linear_form(replace(plain, design=replace(plain.design, noise=noise)))
+    assert not any(close(form.controller, puller, form.dt).stable for puller in pullers_of(config, seeds))

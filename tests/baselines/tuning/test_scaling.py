@@ -102,7 +102,7 @@ def test_one_command_designs_and_another_runs_it(tmp_path, monkeypatch, capsys):
     write_puller(find_puller("silicon-300mm"), place)
     figures = Figures(0.1, 0.01, 0.01, 0.1, 1900.0, 0.0, 5400)
     monkeypatch.setattr(tune, "measure", lambda policy, config, seeds: figures)
-    monkeypatch.setattr(tune, "in_processes", lambda function, tasks, look: enumerate(map(function, tasks)))
+    monkeypatch.setattr(tune, "side_by_side", lambda function, tasks, *_: enumerate(map(function, tasks)))
     assert tune.main(["--puller", str(place), "--trials", "10"]) == 0
     for name in ("lqg-at-0.02", "paper-tuned", "pid-conventional", "industrial"):
         kept = json.loads((tmp_path / "mine" / f"{name}.json").read_text())

@@ -10,18 +10,20 @@ from cz_gym import CzEnv, Parameters
 from cz_gym.action import HEATER_RANGE, MadeFor
 from cz_gym.baselines.policy import OpenLoop
 from cz_gym.baselines.registry import make_controller
+from cz_gym.episodes.scenario import Reference
 from cz_gym.errors import CzError
 from cz_gym.machine.identify import Excited, identify, read_log, record_log
+from cz_gym.machine.identify.__main__ import main
 from cz_gym.machine.identify.estimate import HEATER, LAGS, PULL
 from cz_gym.machine.identify.excitation import CHIPS, SEQUENCE
 from cz_gym.machine.identify.grid import Log, prepare, shift_drives
 from cz_gym.machine.identify.model import LAM, Lags, Model, Noise, heating, predict, sensitivities
 from cz_gym.machine.identify.moves import measure_excitation
 from cz_gym.machine.identify.verdict import coloured
-from cz_gym.machine.puller import DEFAULT
+from cz_gym.machine.puller import DEFAULT, find_puller
 from cz_gym.observation import MEASURED, decode
 from tests.foreign_puller import ForeignPuller, Operator, drive, write_log
-from tests.machine.identify.conftest import TRUTH
+from tests.machine.identify.conftest import OWN, TRUTH
 
 
 @pytest.mark.parametrize(("interval", "off"), [(5.0, 3e-4), (10.0, 3e-4)])
@@ -188,3 +190,22 @@ def test_coloured_errors_are_told_from_white_ones_and_from_the_rotation_s():
     white[100:150] = np.nan
     ripple = np.sin(2.1 * np.arange(2000))
     assert coloured(white + ripple) < 0.15 < coloured(white[1:] + 0.3 * white[:-1])
+
+
+@pytest.mark.slow
+def test_the_disturbances_of_a_log_grow_the_same_ring_within_its_noise(tmp_path):
+    """Twice the same controller: two logs of equal disturbances differ by the noise of both cameras."""
+    own = replace(OWN, reference=Reference())
+    env = CzEnv(own, 0.5, "measured", parameters=TRUTH, action="direct", info="all")
+    pid = make_controller("pid-conventional", env.unwrapped.config)
+    record_log(env, Excited(pid), tmp_path / "log.csv", seed=3)
+    command = [str(tmp_path / "log.csv"), "--out", str(tmp_path / "own.toml"), "--series", str(tmp_path / "day.csv")]
+    assert main(command) == 0
+    puller = find_puller(tmp_path / "own.toml")
+    again = CzEnv(tmp_path / "day.csv", observation="measured", puller=puller, action="direct", info="all")
+    record_log(again, Excited(make_controller("pid-conventional", again.config)), tmp_path / "again.csv", seed=5)
+    ring, simulated = (read_log(tmp_path / name).ring for name in ("log.csv", "again.csv"))
+    noise = np.sqrt(2.0) * puller.camera_noise[0]
+    assert np.std(ring) > 2.0 * puller.camera_noise[0], "there is something to grow again"
+    assert np.std(ring - simulated) < 1.2 * noise
+    assert np.corrcoef(ring, simulated)[0, 1] > 0.8
