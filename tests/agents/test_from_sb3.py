@@ -25,6 +25,7 @@ from cz_gym.agents.export import to_onnx
 from cz_gym.config import make_config
 from cz_gym.machine.export.agent import network_of
 from cz_gym.machine.export.trace import Graph
+from cz_gym.observation import HISTORY
 from tests.contracts import facts
 
 pytestmark = pytest.mark.usefixtures("few_crystals")
