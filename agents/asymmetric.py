@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy, ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor, create_mlp
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
@@ -91,7 +92,7 @@ class StateCritic(ContinuousCritic):
 
     def __init__(self, *others: Any, **named: Any) -> None:
         super().__init__(*others, **named)
-        sight, actions = self.features_extractor, int(np.prod(self.action_space.shape))
+        sight, actions = self.features_extractor, get_action_dim(self.action_space)
         width = sight.features_dim + actions * (len(STATE) + 1 + actions)
         sizes = [width, *named["net_arch"]]
         for place in range(self.n_critics):

@@ -9,9 +9,9 @@ import numpy.typing as npt
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
+from cz_gym.body.cost import TOLERANCE
 from cz_gym.body.signals import Logged
 from cz_gym.env import CzEnv
-from cz_gym.evaluation.metrics import TOLERANCE
 from cz_gym.evaluation.protocol import Row
 from cz_gym.evaluation.results import Result
 from cz_gym.evaluation.rollout import Floats
