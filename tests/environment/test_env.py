@@ -52,6 +52,7 @@ def test_everything_advertised_is_there():
         ({"parameters": Parameters(k_l=math.nan)}, "parameter k_l = nan"),
         ({"meniscus": "hurle"}, r"cz_gym\.MeniscusModel"),
         ({"scenaro": "hard"}, "unexpected keyword argument .scenaro.: did you mean .scenario.[?]"),
+        ({"frameskip": 4}, "unexpected keyword argument .frameskip.; choose from scenario"),
         ({"action": "rough"}, "unknown action 'rough'; choose from direct, smooth, rate"),
         ({"info": "everything"}, "info must be one of lean, all, not 'everything'"),
         ({"parameters": Parameters(alpha_0=1.5)}, "nominal meniscus height .* check r_0, alpha_0"),
@@ -64,6 +65,9 @@ def test_bad_arguments_are_refused_in_one_line(make, arguments, says):
     with pytest.raises(ValueError, match=says) as refusal:
         make(**arguments)
     assert "\n" not in str(refusal.value)
+    assert isinstance(refusal.value, TypeError) == says.startswith("unexpected keyword"), (
+        "TorchRL probes with frameskip"
+    )
 
 
 def test_a_drawn_puller_without_operating_point_is_drawn_again():

@@ -25,7 +25,7 @@ from tests.processes import ROOT, python
 
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
-SLOW = {"docs/paper.md", "docs/extend/meniscus.md", "docs/your-puller.md"}
+SLOW = {"docs/paper.md", "docs/extend/meniscus.md", "docs/your-puller.md", "docs/learn/libraries.md"}
 SMALL = {
     "num_envs=10_000": "num_envs=100",
     "make_vec_env(1024": "make_vec_env(32",
@@ -34,6 +34,8 @@ SMALL = {
     "VALIDATION_SEEDS[:10]": "VALIDATION_SEEDS[:2]",
     "VALIDATION_SEEDS[:100]": "VALIDATION_SEEDS[:2]",
     "range(3000)": "range(30)",
+    "update in range(300)": "update in range(2)",
+    "episode in range(20)": "episode in range(2)",
     "learn(9_000_000)": "learn(8192)",
     "seeds=range(20)": "seeds=range(2)",
     "seeds=range(10)": "seeds=range(2)",
