@@ -119,7 +119,8 @@ class Config:
     @property
     def plant_hash(self) -> str:
         """SHA-256 of the plant: code of its equations and its meniscus, and its parameters (16 hex digits)."""
-        numbers = {name: float(value) + 0.0 for name, value in self.parameters._asdict().items()}
+        given, apart = self.parameters._asdict(), self.process.apart
+        numbers = {name: float(value) + 0.0 for name, value in given.items() if name not in apart}
         text = json.dumps([VERSION, _equations_hash(self.process, self.meniscus), numbers], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -143,7 +144,8 @@ class Config:
     @property
     def identity(self) -> Identity:
         """The settings that a saved state depends on."""
-        scenario = f"{self.scenario.name!r} ({self.scenario.hash})"
+        grown = "".join(f", {name} {getattr(self.parameters, name):g}" for name in self.process.apart)
+        scenario = f"{self.scenario.name!r} ({self.scenario.hash}){grown}"
         low, high = self.mix
         mix = float(low) + 0.0, float(high) + 0.0
         seen = f"camera {tuple(self.camera)}" if self.observation == CAMERA else self.observation
@@ -172,7 +174,7 @@ def make_config(
     model: str | float | None = None,
     observation: str = "history",
     control_interval: float | None = None,
-    horizon: float = 10800.0,
+    horizon: float | None = None,
     parameters: Parameters | None = None,
     meniscus: MeniscusModel | None = None,
     camera: Camera | None = None,
@@ -180,6 +182,7 @@ def make_config(
     puller: str | Path | PullerFile | None = None,
     process: Process | None = None,
     weights: Mapping[str, float] | None = None,
+    stage: Any = None,
 ) -> Config:
     """Check the arguments of the environment; CzError names what was given and what is allowed."""
     machine, process = find_puller(puller), process or BODY
@@ -194,16 +197,19 @@ def make_config(
     if camera is not None and observation != CAMERA:
         raise CzError(f'a camera is of use with observation="camera" only, not with {observation!r}')
     interval = positive("control_interval", machine.control_interval if control_interval is None else control_interval)
-    length = positive("horizon", horizon)
+    shape = meniscus or HURLE
+    if not isinstance(shape, MeniscusModel):
+        raise CzError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
+    given = machine.parameters if parameters is None else parameters
+    checked = process.check(process.complete(given, machine.recipe, stage), shape)
+    usual = interval * math.ceil(process.duration(checked, shape) / interval)
+    length = positive("horizon", usual if horizon is None else horizon)
     steps = length / interval
     if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
         raise CzError(f"horizon {horizon} s must be a whole number of control intervals of {interval:g} s")
-    if meniscus is not None and not isinstance(meniscus, MeniscusModel):
-        raise CzError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
-    checked = process.check(machine.parameters if parameters is None else parameters, meniscus or HURLE)
     checked_camera = check_camera(camera_for(checked) if camera is None else camera, checked)
     return Config(
-        *(drawn_from, model, observation, action, interval, length, checked, meniscus or HURLE, checked_camera),
+        *(drawn_from, model, observation, action, interval, length, checked, shape, checked_camera),
         puller=machine,
         process=process,
         weights=_weights(weights or {}, process.weights),

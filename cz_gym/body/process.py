@@ -126,7 +126,7 @@ def lean(slot: Any, measured: Any) -> Any:
 
 
 @jittable
-def carry(extra: Any, u: Any, p: Any, interval: Any) -> Any:
+def carry(extra: Any, u: Any, slot: Any, interval: Any) -> Any:
     """The mean pull speed after an interval."""
     return Extra(cost.moved_mean(extra.v_p_mean, u.v_p, interval))
 

@@ -37,6 +37,7 @@ def _begin(slot: Any, model: Any) -> None:
     nominal = process.nominal(slot.x, slot)
     slot.v_p, slot.Q_H, slot.Q_H_slewed = nominal.v_p, nominal.Q_H, nominal.Q_H
     slot.v_p_before, slot.Q_H_before, slot.clipped = nominal.v_p, nominal.Q_H, 0.0
+    slot.v_p_nominal, slot.Q_H_nominal = nominal.v_p, nominal.Q_H
     slot.fast, slot.slow = first_fluctuation(e, slot.streams)
     slot.dT_i, slot.Q_d, slot.drift = fluctuation(e, slot.fast, slot.slow), 0.0, np.nan
     slot.integral, slot.Q_heats = 0.0, nominal.Q_H

@@ -142,7 +142,7 @@ TANK = Process(
     true_state=jittable(lambda slot, seen, t: Truth(slot.x.h - slot.puller.h_0, slot.x.T - slot.puller.T_0)),
     logged=logged, lean=jittable(lambda slot, seen: Lean(slot.x.h, slot.puller.h_0 + seen.h_ref)), charged=charged,
     cost_terms=cost_terms, cost_slopes=cost_slopes, reward=reward, equations=(derive, rates), Extra=Extra, weights=WEIGHTS,
-    carry=jittable(lambda extra, u, p, interval: Extra(extra.fed + u.v_p * interval)), table=(3, 2),
+    carry=jittable(lambda extra, u, slot, interval: Extra(extra.fed + u.v_p * interval)), table=(3, 2),
 )  # fmt: skip
 # The end of the process.
 
