@@ -201,7 +201,7 @@ def make_config(
     if not isinstance(shape, MeniscusModel):
         raise CzError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
     given = machine.parameters if parameters is None else parameters
-    checked = process.check(process.complete(given, machine.recipe, stage), shape)
+    checked = process.check(process.complete(given, machine, stage), shape)
     usual = interval * math.ceil(process.duration(checked, shape) / interval)
     length = positive("horizon", usual if horizon is None else horizon)
     steps = length / interval

@@ -109,10 +109,10 @@ def carry_nothing(extra: Any, u: Any, slot: Any, interval: Any) -> Any:
     return extra
 
 
-def no_stages(parameters: Any, recipe: Any, stage: Any) -> Any:
+def no_stages(parameters: Any, machine: Any, stage: Any) -> Any:
     """The parameters of a process without stages; CzError for a stage."""
     if stage is not None:
-        raise CzError(f'only CzCrystal-v0 has stages, not this environment: stage={stage!r} must be left out')
+        raise CzError(f"only CzCrystal-v0 has stages, not this environment: stage={stage!r} must be left out")
     return parameters
 
 
@@ -154,7 +154,8 @@ class Process(NamedTuple):
     begin: Function
     """``begin(slot, m)``: the first ``State``; sets ``Extra`` and the table in the slot."""
     nominal: Function
-    """``nominal(x, slot)``: the ``Inputs`` from which actions and observed drives are counted."""
+    """``nominal(x, slot, interval)``: the ``Inputs`` from which actions and observed drives are counted in the control
+    interval [s] that begins at x."""
     hidden_load: Function
     """``hidden_load(p_drift, p)``: heat load [W] that a recipe shifted by p_drift [K] would cancel."""
     disturb: Function
@@ -196,8 +197,8 @@ class Process(NamedTuple):
     table: tuple[int, int] = (0, 0)
     """Rows and columns of ``slot.table``, which ``begin`` fills; none by default."""
     complete: Function = no_stages
-    """``complete(parameters, recipe, stage)``: the parameters that ``check`` takes, of a puller's, its recipe's
-    (:class:`cz_gym.physics.parameters.Recipe`) and the stage that the user names; CzError if there is no such stage."""
+    """``complete(parameters, machine, stage)``: the parameters that ``check`` takes, of a puller's, its file
+    (:class:`cz_gym.machine.puller.PullerFile`) and the stage that the user names; CzError if there is no such stage."""
     apart: tuple[str, ...] = ()
     """Parameters that say what an episode grows; the plant does not depend on them."""
     duration: Function = three_hours

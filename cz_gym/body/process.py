@@ -50,7 +50,7 @@ def begin(slot: Any, m: Any) -> Any:
 
 
 @jittable
-def nominal(x: Any, slot: Any) -> Any:
+def nominal(x: Any, slot: Any, interval: Any) -> Any:
     """The operating point's inputs."""
     return Inputs(slot.puller.v_0, slot.puller.Q_H_0)
 

@@ -13,19 +13,20 @@ from cz_gym.support.units import MM
 
 STAGES = ("crown", "body", "tail", "whole")
 """The parts of a crystal that an episode can grow."""
-APART = (*STAGES, "begins")
-"""Parameters that say which part is grown: the plant does not depend on them."""
+APART = (*STAGES, "begins", "heater_max")
+"""Parameters that say which part is grown, and what the heater can do: the plant does not depend on them."""
 DRAWN = -1.0
 """Value of ``begins`` where each stage begins at its own length."""
 CrystalParameters: Any = NamedTuple(
     "CrystalParameters", [(name, float) for name in (*Parameters._fields, *Recipe._fields, *APART)]
 )
 """A puller's :class:`~cz_gym.physics.parameters.Parameters`, its :class:`~cz_gym.physics.parameters.Recipe`, the share
-of episodes [-] that grow each of the :data:`STAGES`, and the length [m] at which they begin, or :data:`DRAWN`."""
+of episodes [-] that grow each of the :data:`STAGES`, the length [m] at which they begin, or :data:`DRAWN`, and the
+heater's largest power [W]."""
 
 
-def complete(parameters: Any, recipe: Recipe, stage: Any = None) -> Any:
-    """:data:`CrystalParameters` of a puller, a recipe and a stage, by default the crown.
+def complete(parameters: Any, machine: Any, stage: Any = None) -> Any:
+    """:data:`CrystalParameters` of a puller, the recipe in its file, and a stage, by default the crown.
 
     A stage is a name, names with their shares of the episodes, or the length [m] at which three hours of growth begin.
     Parameters that are complete keep their recipe, and without a stage their own.
@@ -33,8 +34,9 @@ def complete(parameters: Any, recipe: Recipe, stage: Any = None) -> Any:
     if isinstance(parameters, CrystalParameters):
         return parameters if stage is None else parameters._replace(**_shares(stage, parameters))
     given = check_parameters(parameters)
-    check_numbers("recipe's", recipe)
-    whole = CrystalParameters(*given, *map(float, recipe), 1.0, 0.0, 0.0, 0.0, DRAWN)
+    check_numbers("recipe's", machine.recipe)
+    power = math.inf if machine.heater_max is None else machine.heater_max
+    whole = CrystalParameters(*given, *map(float, machine.recipe), 1.0, 0.0, 0.0, 0.0, DRAWN, power)
     return check_shape(whole if stage is None else whole._replace(**_shares(stage, whole)))
 
 
@@ -60,7 +62,9 @@ def _shares(stage: Any, q: Any) -> dict[str, float]:
         return fields | {"body": 1.0, "begins": float(stage)}
     shares = {stage: 1.0} if isinstance(stage, str) else stage
     if not (isinstance(shares, Mapping) and shares):
-        raise CzError(f"stage must be one of {', '.join(STAGES)}, a dict of them with shares, or a length, not {stage!r}")
+        raise CzError(
+            f"stage must be one of {', '.join(STAGES)}, a dict of them with shares, or a length, not {stage!r}"
+        )
     for name, share in shares.items():
         if name not in STAGES:
             raise CzError(unknown("stage", name, STAGES, ", or a length in metres"))

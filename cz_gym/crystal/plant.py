@@ -12,7 +12,7 @@ import numpy as np
 
 from cz_gym.body.plant import Puller, derive_puller, heating, hidden_load, interface
 from cz_gym.episodes.draw import randomised
-from cz_gym.jit.compile import force_inlined, joined, jittable
+from cz_gym.jit.compile import force_inlined, jittable, joined
 
 
 class State(NamedTuple):

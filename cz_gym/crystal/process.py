@@ -1,6 +1,5 @@
 """The process of ``CzCrystal-v0``: plant, recipe, signals and task of a whole crystal as one value for the engine."""
 
-import math
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -18,12 +17,12 @@ from cz_gym.jit.compile import jittable
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import check_parameters
 from cz_gym.process import NO_OPERATING_POINT, Inputs, Process, Seen
-from cz_gym.support.units import MM
+from cz_gym.support.units import KILO, MM
 
 from . import plant, recipe, signals, task
 from .parameters import APART, STAGES, check_shape, complete, parts
 from .plant import Disturbance, State, at_interface
-from .shape import shape_at
+from .shape import growth_rate, shape_at
 
 SLACK = 1.3
 """Time that an episode may last, in multiples of the recipe's [-]."""
@@ -67,10 +66,12 @@ def check(parameters: Any, meniscus: MeniscusModel) -> Any:
     left = growth.M_0 - at.M_s - at.M_men
     for fails, what in (
         (left <= 0.0, f"the charge of {growth.M_0:g} kg is used up: the crystal weighs {at.M_s[-1]:.3g} kg"),
-        (~(at.T_b > p.T_m), "the melt would have to be colder than its melting point: less growth rate there"),
         (~((at.h_c >= task.HEIGHT_MIN) & (at.h_c <= HEIGHT_MAX_IN_A * p.a)), "the meniscus is out of its range"),
+        (np.isnan(at.ring), f"the meniscus {meniscus.name!r} does not hold ({meniscus.covers})"),
+        (~(at.T_b > p.T_m), "the melt would have to be colder than its melting point: less growth rate there"),
         (~(at.v_p > 0.0), "the pull speed is not positive"),
         (~(at.Q_H > 0.0), "the heater's power is not positive"),
+        (checked.heater_max < at.Q_H, f"the heater needs more than heater_max_kW = {checked.heater_max / KILO:g}"),
     ):
         if fails.any():
             length = max(float(lengths(p)[np.argmax(fails)]), 0.0) / MM
@@ -106,9 +107,10 @@ def begin(slot: Any, m: Any) -> Any:
 
 
 @jittable
-def nominal(x: Any, slot: Any) -> Any:
-    """The recipe's inputs at the length grown."""
-    row, share = recipe.place(x.L, slot.puller)
+def nominal(x: Any, slot: Any, interval: Any) -> Any:
+    """The recipe's inputs at the length of the interval's middle: held inputs would else lag behind it."""
+    p = slot.puller
+    row, share = recipe.place(x.L + 0.5 * interval * growth_rate(x.L, p), p)
     return Inputs(
         recipe.look_up(slot.table, row, share, recipe._v_p), recipe.look_up(slot.table, row, share, recipe._Q_H)
     )
@@ -133,9 +135,7 @@ def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, m: Any) -> An
     """The rows of ``info``, growth taken at a height within the limits."""
     p, x = slot.puller, slot.x
     at = State(x.r_c, task.height_inside(x.h_c, p), x.T_1, x.T_2, x.T_b, x.L, x.A_s, x.M_s, x.N)
-    return signals.logged(
-        slot, measured, cost, t, ring, at_interface(at, Disturbance(slot.Q_d, slot.dT_i), p, m.slope)
-    )
+    return signals.logged(slot, measured, cost, t, ring, at_interface(at, Disturbance(slot.Q_d, slot.dT_i), p, m.slope))
 
 
 @jittable

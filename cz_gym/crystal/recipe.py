@@ -1,7 +1,8 @@
 """The recipe by flat inversion: from shape and growth rate against length follow height, temperatures and drives.
 
-Nothing is integrated in time. Shape gives the cone angle and with it the meniscus height, growth rate the heat flux from
-the melt and with it the melt's temperature; what its rate of change needs gives the crucible's, and so on to the power.
+Nothing is integrated in time. Shape gives the cone angle and with it the meniscus height, growth rate the heat flux
+from the melt and with it the melt's temperature; what its rate of change needs gives the crucible's, and so on to the
+power.
 The result is a table against length, one for each drawn puller, in ``slot.table``.
 """
 
@@ -11,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.body.plant import fourth_power
-from cz_gym.jit.compile import jittable, labelled
+from cz_gym.jit.compile import jittable
 
-from .plant import Interface, State, crystal_flux, depth, meniscus_mass, wall
+from .plant import State, crystal_flux, depth, meniscus_mass, wall
 from .shape import shape_at
 
 ROWS, MARGIN = 512, 8

@@ -118,7 +118,9 @@ class TrueState(NamedTuple):
     r_ref: Annotated[Any, _SHARED["r_ref"]]
     r_ref_5mm: Annotated[Any, _SHARED["r_ref_5mm"]]
     r_ref_25mm: Annotated[Any, _SHARED["r_ref_25mm"]]
-    T_1_ref: Annotated[Any, _SHARED["T_1_ref"]]
+    T_1_ref: Annotated[
+        Any, Channel("K", 5.0, "recipe of the heater temperature, as it is given, minus the perfect one")
+    ]
     v_p: Annotated[Any, _SHARED["v_p"]]
     Q_H: Annotated[Any, _SHARED["Q_H"]]
     v_p_mean: Annotated[Any, _SHARED["v_p_mean"]]
@@ -146,7 +148,7 @@ def true_state(slot: Any, measured: Any, t: Any) -> Any:
         r_ref=measured.r_ref,
         r_ref_5mm=measured.r_ref_5mm,
         r_ref_25mm=measured.r_ref_25mm,
-        T_1_ref=measured.T_1_ref,
+        T_1_ref=recipe_error(L, slot.episode) + drift(t, slot.episode),
         v_p=measured.v_p,
         Q_H=measured.Q_H,
         v_p_mean=measured.v_p_mean,
@@ -192,9 +194,7 @@ class Logged(NamedTuple):
     term_pull: Annotated[Any, Channel("1", 1.0, "the reward's term of the mean pull speed")]
     term_pull_step: Annotated[Any, Channel("1", 1.0, "the reward's term of the step of the pull speed")]
     term_heater_step: Annotated[Any, Channel("1", 1.0, "the reward's term of the step of the heater power")]
-    cost: Annotated[
-        Any, Channel("1", 1.0, "1 if |r_c - r_ref| > 0.5 mm or v_p_mean is more than 3 % of v_0, else 0")
-    ]
+    cost: Annotated[Any, Channel("1", 1.0, "1 if |r_c - r_ref| > 0.5 mm or v_p_mean is more than 3 % of v_0, else 0")]
     stage: Annotated[Any, Channel("1", 1.0, "0 crown, 1 body, 2 tail, by the length")]
     succeeded: Annotated[Any, Channel("bool", 1.0, "whether the length was reached")]
     action_clipped: Annotated[Any, Channel("bool", 1.0, "whether the action lay outside its box")]
@@ -216,9 +216,9 @@ def succeeded(slot: Any) -> Any:
 @jittable
 def part_at(L: Any, p: Any) -> Any:
     """0 in the crown, 1 in the body, 2 in the tail."""
-    if L < p.crown_length:
+    if p.crown_length > L:
         return 0.0
-    return 1.0 if L <= p.crown_length + p.body_length else 2.0
+    return 1.0 if p.crown_length + p.body_length >= L else 2.0
 
 
 @jittable

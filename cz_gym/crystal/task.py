@@ -94,7 +94,11 @@ def reference_along(slot: Any) -> None:
 def stretch(slot: Any, times: Any) -> None:
     """Stretch what a scenario spreads over three hours; what lasts some seconds or minutes keeps its duration."""
     e = slot.episode
-    e.drift_start, e.drift_duration, e.drift_rate = e.drift_start * times, e.drift_duration * times, e.drift_rate / times
+    e.drift_start, e.drift_duration, e.drift_rate = (
+        e.drift_start * times,
+        e.drift_duration * times,
+        e.drift_rate / times,
+    )
     e.bias_drift_start, e.bias_drift_duration = e.bias_drift_start * times, e.bias_drift_duration * times
     for which in range(FREEZES):
         later = (times - 1.0) * slot.freezes[which, 0]
@@ -123,7 +127,8 @@ def within_limits(x: Any, r_ref: Any, limit: Any, p: Any) -> Any:
 def accept(slot: Any, x: Any, new: Any, u: Any, d: Any, t: Any, dt: Any, limit: Any, m: Any) -> Any:
     """The state after a substep and whether the crystal grows on, is lost, or long enough.
 
-    After an impossible jump it is the state before. Low menisci freeze as in :func:`cz_gym.body.process.accept_substep`.
+    After an impossible jump it is the state before. Low menisci freeze as those of a body do
+    (:func:`cz_gym.body.process.accept_substep`).
     """
     p = slot.puller
     widest = limit * CONE_LIMIT if in_cone(new.L, p) else limit
@@ -133,5 +138,5 @@ def accept(slot: Any, x: Any, new: Any, u: Any, d: Any, t: Any, dt: Any, limit: 
         grows = x.h_c + 0.5 * dt * (u.v_p - at_interface(x, d, p, m.slope).v_g) >= HEIGHT_MIN
     if not grows and (inside or not (np.abs(new.r_c - x.r_c) < _JUMP and np.abs(new.h_c - x.h_c) < _JUMP)):
         new = labelled(State, x)
-    long_enough = DONE if new.L >= slot.stop else GROWS
+    long_enough = DONE if slot.stop <= new.L else GROWS
     return new, (long_enough if grows else LOST)

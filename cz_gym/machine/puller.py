@@ -26,7 +26,7 @@ from cz_gym.support.atomic_files import naming, write_files
 from cz_gym.support.names import unknown
 from cz_gym.support.units import CELSIUS, KILO, MM
 
-from .toml_numbers import FORMAT, read_numbers, write_numbers
+from .toml_numbers import FORMAT, OPTIONAL, read_numbers, write_numbers
 
 FOLDER = Path(__file__).parent / "pullers"
 """Folder of the files that ship."""
@@ -48,7 +48,7 @@ class PullerFile:
 
     name: str = "default"
     parameters: Parameters = field(default_factory=Parameters)
-    recipe: Recipe = Recipe()
+    recipe: Recipe = Recipe()  # noqa: RUF009  (immutable)
     """The whole crystal that it grows."""
     heater_range: float = HEATER_RANGE
     heater_max: float | None = None
@@ -107,14 +107,16 @@ class PullerFile:
 
     @cached_property
     def hash(self) -> str:
-        """SHA-256 of everything but the name (16 hex digits)."""
+        """SHA-256 of everything but the name, and the recipe, which is in the plant's hash (16 hex digits)."""
         plain, later = [], {}
         for quantity in MACHINE.values():
             value = value_of(self, quantity)
             value = value if value is None else (np.asarray(value, float) + 0.0).tolist()
+            if quantity.table == OPTIONAL:
+                continue
             if not quantity.later:
                 plain.append(value)
-            elif value not in (None, getattr(Recipe(), quantity.symbol, None)):
+            elif value is not None:
                 later[quantity.symbol] = value
         contents = [FORMAT, plain, *([later] if later else [])]
         return hashlib.sha256(json.dumps(contents).encode()).hexdigest()[:16]

@@ -110,13 +110,13 @@ def accept(slot, x, new, u, d, t, dt, limit, m):
 @jittable
 def measure(slot, t):
     p, e = slot.puller, slot.episode
-    h_ref, u = reference(t, e), nominal(slot.x, slot)
+    h_ref, u = reference(t, e), nominal(slot.x, slot, 0.0)
     T = slot.T_1 - p.T_0
     return Read(slot.ring - p.h_0 - h_ref, slot.valid, h_ref, recipe(t, e), T, slot.v_p - u.v_p, slot.Q_H - u.Q_H)
 
 
 @jittable
-def nominal(x, slot):
+def nominal(x, slot, interval):
     return Inputs(slot.puller.v_0, slot.puller.G * (slot.puller.T_0 - slot.puller.T_a))
 
 
