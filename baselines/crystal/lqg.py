@@ -54,6 +54,7 @@ class Weights(NamedTuple):
     """What the regulator weighs: deviations that cost 1."""
 
     radius: float = 0.5 * MM
+    height: float = 0.4 * MM
     pull: float = 0.3 * MM_PER_MIN
     pull_step: float = 0.06 * MM_PER_MIN
     power: float = 4.0 * KILO
@@ -74,9 +75,9 @@ class Gains(NamedTuple):
 
 
 @lru_cache(maxsize=8)
-def design(parameters: Any, meniscus: MeniscusModel, dt: float, noise: Noise, weights: Weights) -> Gains:
+def design(parameters: Any, meniscus: MeniscusModel, dt: float, lam: float, noise: Noise, weights: Weights) -> Gains:
     """Design filter and regulator for a control interval [s]."""
-    at = along(parameters, meniscus, 0.5)
+    at = along(parameters, meniscus, lam)
     designs = [_at(A, B, C, dt, noise, weights) for A, B, C in zip(at.A, at.B, at.C, strict=True)]
     return Gains(at.L, *(np.stack(each) for each in zip(*designs, strict=True)))
 
@@ -106,7 +107,7 @@ def _regulator(A: Floats, B: Floats, weights: Weights) -> Floats:
     n = STATES + DRIVES
     move, act, cost, cross = np.zeros((n, n)), np.zeros((n, DRIVES)), np.zeros((n, n)), np.zeros((n, DRIVES))
     move[:STATES, :STATES], act[:STATES], act[STATES:] = A, B, np.eye(DRIVES)
-    cost[0, 0] = weights.radius**-2.0
+    cost[0, 0], cost[1, 1] = weights.radius**-2.0, weights.height**-2.0
     steps = np.diag([weights.pull_step**-2.0, weights.power_step**-2.0])
     cost[STATES:, STATES:], cross[STATES:] = steps, -steps
     drives = steps + np.diag([weights.pull**-2.0, weights.power**-2.0])
@@ -138,6 +139,8 @@ class CrystalLQG(MeasuredController):
 
     process: ClassVar[Process] = CRYSTAL
 
+    lam: float = 0.5
+    """Share of conduction in its model [-]."""
     noise: Noise = Noise()
     weights: Weights = Weights()
     jump: float = 1.0 * MM
@@ -151,7 +154,7 @@ class CrystalLQG(MeasuredController):
 
     def step(self, seen: Measured, memory: Memory) -> tuple[Floats, Floats, Memory]:
         """Pull speed and heater power above the recipe's, and the new memory."""
-        at = design(self.parameters, self.meniscus, self.control_interval, self.noise, self.weights)
+        at = design(self.parameters, self.meniscus, self.control_interval, self.lam, self.noise, self.weights)
         u = np.stack([seen.v_p, seen.Q_H], axis=1)
         near, share = _between(at.L, seen.L)
         A, B, C, K, F = (_mix(each, near, share) for each in at[1:])
@@ -179,5 +182,3 @@ def _times(matrices: Floats, vectors: Floats) -> Floats:
     """A matrix a crystal times a vector a crystal."""
     product: Floats = np.einsum("nij,nj->ni", matrices, vectors)
     return product
-
-

@@ -17,9 +17,13 @@ from cz_gym.baselines.pid.temperature_loop import Heat, TemperatureLoop
 from cz_gym.baselines.policy import Floats, MeasuredController, check_numbers
 from cz_gym.crystal.linearisation import Along, along
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.crystal.shape import in_cone
 from cz_gym.crystal.signals import Measured, TrueState
 from cz_gym.process import Process, scales, signals
+from cz_gym.support.units import MM
+
+
+BLEND = 40.0 * MM
+"""Length of body over which the gain changes after the crown and before the tail [m]."""
 
 
 class Memory(NamedTuple):
@@ -50,6 +54,8 @@ class CrystalPID(MeasuredController):
     """Gain of the error in crown and tail [-]."""
     compensates: bool = True
     """Whether the predicted height is taken off the ring."""
+    lam: float = 0.5
+    """Share of conduction in its model [-]."""
     slow: float = 2.0e-4
     """Rate with which the predicted height is forgotten [rad/s]."""
     T_f: float = 20.0
@@ -64,8 +70,15 @@ class CrystalPID(MeasuredController):
 
     @cached_property
     def schedule(self) -> Along:
-        """The linearisation along the recipe, half conduction and half convection."""
-        return along(self.parameters, self.meniscus, 0.5)
+        """The linearisation along the recipe."""
+        return along(self.parameters, self.meniscus, self.lam)
+
+    def gain(self, L: Floats) -> Floats:
+        """Gain of the error at a length: it changes within :data:`BLEND` of the body, for a jump would kick the pull."""
+        q = self.parameters
+        ends = q.crown_length + q.body_length
+        at = q.crown_length, q.crown_length + BLEND, ends - BLEND, ends
+        return np.interp(L, at, (self.cone_gain, 1.0, 1.0, self.cone_gain))
 
     def at_rest(self, seen: Measured) -> Memory:
         """The applied pull speed and power continue."""
@@ -84,7 +97,7 @@ class CrystalPID(MeasuredController):
         filtered = memory.filtered + pace * (error - memory.filtered)
         missed = (seen.v_p - memory.command) / self.pid.K_p
         tracking = memory.pid.integral + min(dt / self.T_track, 1.0) * missed
-        gain = np.where(in_cone(seen.L, self.parameters), self.cone_gain, 1.0)
+        gain = self.gain(seen.L)
         pull, pid = self.pid.step(gain * filtered, memory.pid._replace(integral=tracking), dt)
         power, heat = self.heater.step(seen, memory.heat, dt, self.v_0, self.heater_range)
         return pull, power, Memory(height, filtered, pid, pull, heat)

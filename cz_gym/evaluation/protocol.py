@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from cz_gym.body.process import BODY
 from cz_gym.config import Config, make_config
@@ -52,6 +53,8 @@ class Row:
     """Seed of its first crystal."""
     process: Process = BODY
     """What is simulated."""
+    stage: Any = None
+    """Part of the crystal that is grown, where the process has stages."""
 
     @property
     def control_interval(self) -> float:
@@ -66,8 +69,9 @@ class Row:
         """Return the settings that a controller is designed for: the same on Hurle's meniscus."""
         interval, puller = self.control_interval, self.puller
         return make_config(
-            self.scenario, self.model, observation, interval, action=action, puller=puller, process=self.process
-        )
+            self.scenario, self.model, observation, interval, action=action, puller=puller, process=self.process,
+            stage=self.stage,
+        )  # fmt: skip
 
     @property
     def grown_on(self) -> str:
