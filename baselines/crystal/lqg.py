@@ -5,7 +5,7 @@ model has half conduction and half convection, and three states that are not the
 fluctuation, a heat load on the melt, and the error of the recipe's temperature. SI units.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple
 
@@ -141,8 +141,8 @@ class CrystalLQG(MeasuredController):
 
     lam: float = 0.5
     """Share of conduction in its model [-]."""
-    noise: Noise = Noise()
-    weights: Weights = Weights()
+    noise: Noise = field(default_factory=Noise)
+    weights: Weights = field(default_factory=Weights)
     jump: float = 1.0 * MM
     """Largest innovation of the ring that counts [m]."""
 

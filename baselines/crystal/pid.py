@@ -21,7 +21,6 @@ from cz_gym.crystal.signals import Measured, TrueState
 from cz_gym.process import Process, scales, signals
 from cz_gym.support.units import MM
 
-
 BLEND = 40.0 * MM
 """Length of body over which the gain changes after the crown and before the tail [m]."""
 
@@ -74,7 +73,7 @@ class CrystalPID(MeasuredController):
         return along(self.parameters, self.meniscus, self.lam)
 
     def gain(self, L: Floats) -> Floats:
-        """Gain of the error at a length: it changes within :data:`BLEND` of the body, for a jump would kick the pull."""
+        """Gain of the error at a length: it changes within :data:`BLEND` of the body, as a jump would kick the pull."""
         q = self.parameters
         ends = q.crown_length + q.body_length
         at = q.crown_length, q.crown_length + BLEND, ends - BLEND, ends

@@ -124,7 +124,7 @@ def test_a_changed_reference_is_part_of_the_recipe():
 
 
 @pytest.mark.parametrize(
-    ("moved", "by"), [("r_c", 13 * MM), ("h_c", -1.6 * MM), ("h_c", 9 * MM), ("T_b", -4.0), ("r_c", np.nan)]
+    ("moved", "by"), [("r_c", 13 * MM), ("h_c", -1.8 * MM), ("h_c", 9 * MM), ("T_b", -4.0), ("r_c", np.nan)]
 )
 def test_how_a_crystal_is_lost(moved, by):
     env = CzCrystalEnv(scenario="nominal", stage=0.05, **PLAIN)
