@@ -125,7 +125,8 @@ class MeasuredController(ABC):
 
     def read(self, array: Floats) -> Measured:
         """The channels of observations, shape (n, channels), in SI units."""
-        return decode(array, self.v_0, self.heater_range, self.process)
+        seen: Measured = decode(array, self.v_0, self.heater_range, self.process)
+        return seen
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True

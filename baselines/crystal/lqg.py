@@ -15,7 +15,6 @@ from scipy.linalg import expm, solve_discrete_are
 from cz_gym.baselines.policy import Floats, MeasuredController
 from cz_gym.crystal.linearisation import along
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.crystal.signals import Measured
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.process import Process
 from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN
@@ -112,8 +111,8 @@ def _regulator(A: Floats, B: Floats, weights: Weights) -> Floats:
     cost[STATES:, STATES:], cross[STATES:] = steps, -steps
     drives = steps + np.diag([weights.pull**-2.0, weights.power**-2.0])
     S = _solve(move, act, cost, drives, _SIZES, _SIZES[STATES:], cross)
-    gain: Floats = np.linalg.solve(drives + act.T @ S @ act, act.T @ S @ move + cross.T)
-    return -gain
+    gain = np.linalg.solve(drives + act.T @ S @ act, act.T @ S @ move + cross.T)
+    return np.asarray(-gain, np.float64)
 
 
 def _solve(A: Floats, B: Floats, Q: Floats, R: Floats, x: Floats, u: Floats, S: Floats | None = None) -> Floats:
@@ -146,13 +145,13 @@ class CrystalLQG(MeasuredController):
     jump: float = 1.0 * MM
     """Largest innovation of the ring that counts [m]."""
 
-    def at_rest(self, seen: Measured) -> Memory:
+    def at_rest(self, seen: Any) -> Memory:
         """On the recipe, as far as the first sample tells."""
         x = np.zeros((len(seen.L), STATES))
         x[:, STATES - 1] = seen.T_1_ref - seen.T_1
         return Memory(x)
 
-    def step(self, seen: Measured, memory: Memory) -> tuple[Floats, Floats, Memory]:
+    def step(self, seen: Any, memory: Memory) -> tuple[Floats, Floats, Memory]:
         """Pull speed and heater power above the recipe's, and the new memory."""
         at = design(self.parameters, self.meniscus, self.control_interval, self.lam, self.noise, self.weights)
         u = np.stack([seen.v_p, seen.Q_H], axis=1)

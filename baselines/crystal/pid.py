@@ -74,18 +74,18 @@ class CrystalPID(MeasuredController):
 
     def gain(self, L: Floats) -> Floats:
         """Gain of the error at a length: it changes within :data:`BLEND` of the body, as a jump would kick the pull."""
-        q = self.parameters
+        q: Any = self.parameters
         ends = q.crown_length + q.body_length
         at = q.crown_length, q.crown_length + BLEND, ends - BLEND, ends
         return np.interp(L, at, (self.cone_gain, 1.0, 1.0, self.cone_gain))
 
-    def at_rest(self, seen: Measured) -> Memory:
+    def at_rest(self, seen: Any) -> Memory:
         """The applied pull speed and power continue."""
         zero = np.zeros_like(seen.v_p)
         pid = PIDState(zero, zero, seen.v_p / self.pid.K_p)
         return Memory(zero, zero, pid, seen.v_p, self.heater.at_rest(seen))
 
-    def step(self, seen: Measured, memory: Memory) -> tuple[Floats, Floats, Memory]:
+    def step(self, seen: Any, memory: Memory) -> tuple[Floats, Floats, Memory]:
         """Pull speed and heater power above the recipe's, and the new memory."""
         dt, at = self.control_interval, self.schedule
         forgets = np.interp(seen.L, at.L, at.a_h) + self.slow

@@ -9,12 +9,14 @@ from .pid import CrystalPID, TrueRadiusPID
 
 HEATER = TemperatureLoop(K=1500.0, T_i=300.0, K_pull=10.0, T_pull=2000.0, T_mean=300.0)
 """The heater's loop on the recipe, trimmed where the mean pull speed is off the recipe's."""
-BODY_GAINS = SeriesPID(N=10.0)
-"""Table 1 of the paper, with a slower derivative filter."""
-RING_PID = CrystalPID(pid=BODY_GAINS, compensates=False, heater=HEATER)
-REDUCED_PID = CrystalPID(pid=BODY_GAINS, compensates=False, cone_gain=0.15, heater=HEATER)
-COMPENSATED_PID = CrystalPID(pid=BODY_GAINS, lam=0.2, cone_gain=0.15, heater=HEATER)
-TRUE_PID = TrueRadiusPID(pid=BODY_GAINS, heater=HEATER)
+CONVENTIONAL = SeriesPID(K_p=0.0018, T_i=376.0, T_d=1069.0, N=25.0)
+"""Gains of ``pid-conventional`` of ``Cz-v0``, which needs no compensator."""
+COMPENSATED = SeriesPID(K_p=0.008, T_i=1500.0, T_d=800.0, N=12.0)
+"""Gains near those of the paper, with a slower derivative filter."""
+RING_PID = CrystalPID(pid=CONVENTIONAL, compensates=False, T_f=10.0, heater=HEATER)
+REDUCED_PID = CrystalPID(pid=CONVENTIONAL, compensates=False, T_f=10.0, cone_gain=0.15, heater=HEATER)
+COMPENSATED_PID = CrystalPID(pid=COMPENSATED, lam=0.1, slow=1.0e-3, cone_gain=0.15, heater=HEATER)
+TRUE_PID = TrueRadiusPID(pid=SeriesPID(N=10.0), heater=HEATER)
 LQG_ALONG = CrystalLQG(
     lam=0.1,
     noise=Noise(height=4.0e-5, temperature=1.0e-3, load=800.0),

@@ -17,7 +17,7 @@ APART = (*STAGES, "begins", "heater_max")
 """Parameters that say which part is grown, and what the heater can do: the plant does not depend on them."""
 DRAWN = -1.0
 """Value of ``begins`` where each stage begins at its own length."""
-CrystalParameters: Any = NamedTuple(
+CrystalParameters: Any = NamedTuple(  # type: ignore[misc]
     "CrystalParameters", [(name, float) for name in (*Parameters._fields, *Recipe._fields, *APART)]
 )
 """A puller's :class:`~cz_gym.physics.parameters.Parameters`, its :class:`~cz_gym.physics.parameters.Recipe`, the share
@@ -36,7 +36,7 @@ def complete(parameters: Any, machine: Any, stage: Any = None) -> Any:
     given = check_parameters(parameters)
     check_numbers("recipe's", machine.recipe)
     power = math.inf if machine.heater_max is None else machine.heater_max
-    whole = CrystalParameters(*given, *map(float, machine.recipe), 1.0, 0.0, 0.0, 0.0, DRAWN, power)
+    whole = CrystalParameters(*given, *map(float, machine.recipe), 1.0, 0.0, 0.0, 0.0, DRAWN, power)  # type: ignore[call-arg]
     return check_shape(whole if stage is None else whole._replace(**_shares(stage, whole)))
 
 
@@ -57,7 +57,7 @@ def _shares(stage: Any, q: Any) -> dict[str, float]:
     fields: dict[str, Any] = dict.fromkeys(STAGES, 0.0) | {"begins": DRAWN}
     if isinstance(stage, Real) and not isinstance(stage, bool):
         end = q.crown_length + q.body_length + q.tail_length
-        if not 0.0 <= stage < end:
+        if not 0.0 <= stage < end:  # type: ignore[operator]
             raise CzError(f"stage = {float(stage):g} m begins outside of the crystal, which is {end:g} m long")
         return fields | {"body": 1.0, "begins": float(stage)}
     shares = {stage: 1.0} if isinstance(stage, str) else stage
@@ -68,7 +68,7 @@ def _shares(stage: Any, q: Any) -> dict[str, float]:
     for name, share in shares.items():
         if name not in STAGES:
             raise CzError(unknown("stage", name, STAGES, ", or a length in metres"))
-        if not (isinstance(share, Real) and not isinstance(share, bool) and 0.0 < share < math.inf):
+        if not (isinstance(share, Real) and not isinstance(share, bool) and 0.0 < share < math.inf):  # type: ignore[operator]
             raise CzError(f"the share of stage {name!r} must be a positive number, not {share!r}")
     total = math.fsum(map(float, shares.values()))
     return fields | {name: float(share) / total for name, share in shares.items()}

@@ -89,7 +89,7 @@ class Grown(NamedTuple):
     begins: float
 
 
-Crystal: Any = NamedTuple("Crystal", [(name, float) for name in (*Puller._fields, *Grown._fields)])
+Crystal: Any = NamedTuple("Crystal", [(name, float) for name in (*Puller._fields, *Grown._fields)])  # type: ignore[misc]
 """The constants of one puller and its crystal: the body's operating point, and :class:`Grown`."""
 
 

@@ -73,7 +73,7 @@ class Recipe(NamedTuple):
 def describe(kind: type[Any] = Parameters) -> dict[str, Quantity]:
     """Map the name of each field of this kind of tuple to its :class:`Quantity`."""
     if kind in (Parameters, Recipe):
-        return {name: MACHINE[name] for name in kind._fields}  # type: ignore[attr-defined]
+        return {name: MACHINE[name] for name in kind._fields}
     hints = get_type_hints(kind, include_extras=True)
     return {name: hints[name].__metadata__[0] for name in kind._fields}
 
