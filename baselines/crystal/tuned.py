@@ -9,8 +9,8 @@ from .pid import CrystalPID, TrueRadiusPID
 
 HEATER = TemperatureLoop(K=1500.0, T_i=300.0, K_pull=10.0, T_pull=2000.0, T_mean=300.0)
 """The heater's loop on the recipe, trimmed where the mean pull speed is off the recipe's."""
-CONVENTIONAL = SeriesPID(K_p=0.0018, T_i=376.0, T_d=1069.0, N=25.0)
-"""Gains of ``pid-conventional`` of ``Cz-v0``, which needs no compensator."""
+CONVENTIONAL = SeriesPID(K_p=0.0018, T_i=2000.0, T_d=1069.0, N=25.0)
+"""Gains of ``pid-conventional`` of ``Cz-v0``, which needs no compensator, with a slower integrator."""
 COMPENSATED = SeriesPID(K_p=0.008, T_i=1500.0, T_d=800.0, N=12.0)
 """Gains near those of the paper, with a slower derivative filter."""
 RING_PID = CrystalPID(pid=CONVENTIONAL, compensates=False, T_f=10.0, heater=HEATER)
