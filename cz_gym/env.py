@@ -181,7 +181,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         stage: Any = None,
         **others: Any,
     ) -> None:
-        known_keywords(others, type(self).__init__)
+        known_keywords(others, type(self).__init__, CzEnv.__init__)
         config = make_config(
             scenario,
             model,
