@@ -1,19 +1,20 @@
 """Policies of stable-baselines3 that are told the plant's true state while they learn; what they act on is sensors.
 
-For a :class:`cz_gym.sb3.CzVecEnv` with ``critic_state``. Critics read the state. The actor of :class:`AsymmetricPolicy`
-(PPO, A2C) reads an estimate of it, which the callback :class:`LearnState` fits by regression:
+For a :class:`cz_gym.sb3.CzVecEnv` with ``critic_state``. Critics read the state; actors read an estimate of it, which
+the callback :class:`LearnState` fits by regression:
 ``PPO(AsymmetricPolicy, make_vec_env(1024, critic_state=True)).learn(steps, LearnState())``. ``predict`` takes the
 observations of the environment as it is. Needs stable-baselines3.
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, MlpExtractor, create_mlp
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy, ContinuousCritic
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor, create_mlp
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 from torch.nn.functional import huber_loss
@@ -27,7 +28,7 @@ PRESENT = len(MEASURED) + 1
 """Number of channels of "history" that show the present; the last one is the integral of the ring error."""
 GAINS = {
     "ring_error": 8.0, "integral": 4.0, "v_p": 8.0, "Q_H": 8.0, "r_c_error": 8.0, "h_c": 8.0, "T_b": 8.0, "dT_i": 2.0,
-    "ring_offset": 8.0, "lam": 4.0,
+    "ring_offset": 8.0, "lam": 4.0, "v_p_mean": 2.0,
 }  # fmt: skip
 """Factors that bring channels that vary little while a crystal is held to the order of 1; the others need none."""
 UNKNOWN = [i for i, each in enumerate(STATE) if each.name not in Measured._fields or each.name == "T_1"]
@@ -70,20 +71,41 @@ class AsymmetricPolicy(Asymmetric, ActorCriticPolicy):
 
 
 class AsymmetricSACPolicy(Asymmetric, SACPolicy):
-    """The policy of stable-baselines3's SAC with critics that are told the true state; its actor has no estimate."""
+    """The policy of stable-baselines3's SAC whose critics are told the true state, and whose actor estimates it.
+
+    As for :class:`AsymmetricPolicy`, :class:`LearnState` fits the estimate.
+    """
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
-        """The actor, on the channels of the observation alone."""
-        return super().make_actor(_Sensors(self.observation_space))
+        """The actor, on the sensors and the estimate."""
+        return super().make_actor(StateEstimator(self.observation_space))
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
+        """The critics, on the true state and its products."""
+        settings = self._update_features_extractor(self.critic_kwargs, StateSight(self.observation_space))
+        return StateCritic(**settings).to(self.device)
 
 
-class _Sensors(FlattenExtractor):
-    def __init__(self, space: Any) -> None:
-        super().__init__(space)
-        self._features_dim = len(HISTORY)
+class StateCritic(ContinuousCritic):
+    """Critics of states and actions, and of their products: the value of an action is nearly quadratic in both."""
 
-    def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        return super().forward(observations)[:, : len(HISTORY)]
+    def __init__(self, *others: Any, **named: Any) -> None:
+        super().__init__(*others, **named)
+        sight, actions = self.features_extractor, int(np.prod(self.action_space.shape))
+        width = sight.features_dim + actions * (len(STATE) + 1 + actions)
+        sizes = [width, *named["net_arch"]]
+        for place in range(self.n_critics):
+            layers = [nn.Sequential(nn.Linear(a, b), nn.LayerNorm(b), nn.SiLU()) for a, b in pairwise(sizes)]
+            self.q_networks[place] = nn.Sequential(*layers, nn.Linear(sizes[-1], 1))
+            self.add_module(f"qf{place}", self.q_networks[place])
+
+    def forward(self, obs: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """One value a critic, each of shape (n, 1)."""
+        sight: Any = self.features_extractor
+        state = torch.cat([sight.state(obs), actions], dim=1)
+        products = (actions[:, :, None] * state[:, None, :]).flatten(1)
+        x = torch.cat([sight(obs), actions, products], dim=1)
+        return tuple(each(x) for each in self.q_networks)
 
 
 def _gains(channels: Sequence[Channel]) -> torch.Tensor:
@@ -132,25 +154,30 @@ class StateSight(BaseFeaturesExtractor):
         self.register_buffer("gains", _gains([*HISTORY, *STATE]), persistent=False)
         self.register_buffer("pairs", pairs, persistent=False)
 
+    def state(self, observations: torch.Tensor) -> torch.Tensor:
+        """The true state within +-4, shape (n, channels of the state)."""
+        return (observations * self.gains)[:, len(HISTORY) :].clamp(-4.0, 4.0)
+
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Shape (n, channels of "history" and of the state) to (n, features)."""
-        seen = observations * self.gains
-        state = seen[:, len(HISTORY) :].clamp(-4.0, 4.0)
-        return torch.cat([seen, 0.5 * state[:, self.pairs[0]] * state[:, self.pairs[1]]], dim=1)
+        state = self.state(observations)
+        products = 0.5 * state[:, self.pairs[0]] * state[:, self.pairs[1]]
+        return torch.cat([observations * self.gains, products], dim=1)
 
 
 class LearnState(BaseCallback):
-    """Fits the :class:`StateEstimator` of an :class:`AsymmetricPolicy` while it learns.
+    """Fits the :class:`StateEstimator` of an :class:`Asymmetric` policy while it learns.
 
-    After each update, it goes once through the last rollout in batches of 512, at the algorithm's learning rate. Not
-    before the update: it must meet the actor that acted.
+    After each update it goes once through the last rollout in batches of 512, at the algorithm's learning rate; not
+    before the update, which must meet the actor that acted. An algorithm with a replay buffer gives it one batch.
     """
 
     seen: torch.Tensor | None = None
 
     def _init_callback(self) -> None:
-        policy = needs(AsymmetricPolicy, self.model.policy, "LearnState fits the estimate of that policy alone")
-        self.estimator: StateEstimator = policy.pi_features_extractor
+        policy: Any = needs(Asymmetric, self.model.policy, "LearnState fits the estimate of such a policy alone")
+        on_policy = isinstance(policy, AsymmetricPolicy)
+        self.estimator: StateEstimator = policy.pi_features_extractor if on_policy else policy.actor.features_extractor
         self.optimizer = torch.optim.Adam(self.estimator.estimate.parameters())
 
     def _on_step(self) -> bool:
@@ -158,7 +185,10 @@ class LearnState(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         model: Any = self.model
-        self.seen = torch.as_tensor(model.rollout_buffer.observations, device=model.device).flatten(0, 1)
+        if hasattr(model, "rollout_buffer"):
+            self.seen = torch.as_tensor(model.rollout_buffer.observations, device=model.device).flatten(0, 1)
+        elif model.num_timesteps > model.learning_starts:
+            self.seen = model.replay_buffer.sample(512).observations
 
     def _on_rollout_start(self) -> None:
         if self.seen is None:

@@ -47,7 +47,7 @@ FIXED = {"heater.share": 1.0, "heater.T_i": 1500.0, "T_track": 3400.0, "T_start"
 the power that is held when the pyrometer goes is far from its mean, which loses crystals."""
 GAINS = np.geomspace(3e-4, 8e-3, 20)
 """Gains that it tries with all the rest, for the default puller [1/s]."""
-STEP, STEP_PRICE = 0.02 * MM_PER_MIN, 0.01
+STEP, STEP_PRICE = 0.02 * MM_PER_MIN, 0.003
 """A pull step RMS of the default puller's, and its price."""
 
 

@@ -10,18 +10,20 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
+import numpy as np
+
 from cz_gym.body.process import BODY
 from cz_gym.camera.view import Camera, camera_for, check_camera
 from cz_gym.episodes.mixture import AnyScenario, Distribution
+from cz_gym.episodes.record import Factors
 from cz_gym.episodes.scenario import Range, Scenario
 from cz_gym.episodes.scenarios import RANDOMIZED, find_distribution, find_scenario, mix_of
 from cz_gym.errors import CzError
-from cz_gym.jit.code_hash import function_hash
 from cz_gym.machine.adapt import adapt_scenario
 from cz_gym.machine.puller import DEFAULT, PullerFile, find_puller
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
-from cz_gym.process import Process
+from cz_gym.process import Inputs, Process
 from cz_gym.support.names import needs, unknown
 
 from .action import ACTIONS, MadeFor
@@ -118,18 +120,24 @@ class Config:
 
     @property
     def plant_hash(self) -> str:
-        """SHA-256 of the plant: code of its equations and its meniscus, and its parameters (16 hex digits)."""
+        """SHA-256 of the plant: its parameters, and what it computes at some points (16 hex digits).
+
+        Not of its code: an equation that is written otherwise, and says the same, is the same plant.
+        """
         given, apart = self.parameters._asdict(), self.process.apart
-        numbers = {name: float(value) + 0.0 for name, value in given.items() if name not in apart}
-        text = json.dumps([VERSION, _equations_hash(self.process, self.meniscus), numbers], sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        numbers = (0.0 if name in apart else float(value) + 0.0 for name, value in given.items())
+        parameters = type(self.parameters)(*numbers)
+        return _hash(VERSION, *parameters, *_computed(self.process, self.meniscus, parameters))
 
     @property
     def reward_hash(self) -> str:
-        """SHA-256 of the reward: code of its terms, and their weights (16 hex digits)."""
-        process = self.process
-        text = f"{function_hash(process.charged, process.carry, process.cost_terms, process.reward)} {self.weights}"
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        """SHA-256 of the reward: its weights, and what it computes at some points (16 hex digits)."""
+        process, numbers = self.process, list[float](self.weights)
+        carried = process.carry(process.Extra(*[1.0] * len(process.Extra._fields)), Inputs(2.0, 3.0), None, 60.0)
+        for size in (10.0**power for power in range(-6, 5)):
+            terms = process.cost_terms(process.Cost(*[size] * len(process.Cost._fields)), self.weights)
+            numbers += [*terms, process.reward(terms, True), process.reward(terms, False)]
+        return _hash(*numbers, *carried)
 
     @property
     def made_for(self) -> MadeFor:
@@ -152,7 +160,7 @@ class Config:
         return Identity(
             *(VERSION, self.plant_hash, scenario, mix, seen, self.action, self.control_interval, self.horizon),
             self.puller.label,
-            ", ".join(f"{name} {weight:g}" for name, weight in self.weights._asdict().items()),
+            ", ".join(f"{name} {weight}" for name, weight in self.weights._asdict().items()),
         )
 
     def with_scenario(self, scenario: AnyScenario) -> Self:
@@ -212,7 +220,7 @@ def make_config(
         *(drawn_from, model, observation, action, interval, length, checked, shape, checked_camera),
         puller=machine,
         process=process,
-        weights=_weights(weights or {}, process.weights),
+        weights=process.weights if weights is None else _weights(weights, process.weights),
     )
 
 
@@ -222,14 +230,29 @@ def _weights(given: Any, usual: Any) -> Any:
     for name, weight in named.items():
         if name not in usual._fields:
             raise CzError(unknown("weight", name, usual._fields))
-        if not isinstance(weight, Real) or not 0.0 <= weight < math.inf:
+        number = isinstance(weight, Real)
+        if not number or not 0.0 <= weight < math.inf:
             raise CzError(f"the weight {name!r} must be a number of at least 0, not {weight!r}")
     return usual._replace(**{name: float(weight) for name, weight in named.items()})
 
 
+def _hash(*numbers: float) -> str:
+    """SHA-256 of numbers, to ten digits (16 hex digits)."""
+    text = " ".join(f"{float(number) + 0.0:.10g}" for number in numbers)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
 @lru_cache(maxsize=64)
-def _equations_hash(process: Process, meniscus: MeniscusModel) -> str:
-    return function_hash(*process.equations, *meniscus.functions)
+def _computed(process: Process, meniscus: MeniscusModel, parameters: Parameters) -> tuple[float, ...]:
+    """What a process computes on a meniscus: constants of a puller, and rates, ring and hidden load at its points."""
+    numbers = list[float]()
+    with np.errstate(all="ignore"):
+        for lam in (0.0, 0.4, 1.0):
+            p = process.derive(parameters, Factors(lam=lam), meniscus)
+            numbers += [*p, process.hidden_load(3.0, p)]
+            for x, u, d in process.points(p):
+                numbers += [*process.rates(x, u, d, p, meniscus), *process.see(x, p, meniscus)]
+    return tuple(numbers)
 
 
 def positive_whole(name: str, value: int) -> int:

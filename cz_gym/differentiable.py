@@ -48,8 +48,9 @@ class Step(NamedTuple):
 
 
 STATES = smooth(BODY)
-"""The differentiable state: radius, meniscus height [m], T_1, T_2, T_b [K], v_p [m/s], Q_H [W], the
-mean of v_p [m/s], the bright ring [m] and the camera's reading of it [m]. All else that a step depends on (disturbances, noise, time) depends on no action."""
+"""The differentiable state: radius, meniscus height [m], T_1, T_2, T_b [K], v_p [m/s], Q_H [W], the mean
+of v_p [m/s], the bright ring [m] and the camera's reading of it [m]. All else that a step depends on (disturbances,
+noise, time) depends on no action."""
 
 
 class DifferentiableBatch:

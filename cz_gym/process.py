@@ -185,8 +185,9 @@ class Process(NamedTuple):
     """``cost_slopes(charged, weights)``: the derivative of each term by its own number."""
     reward: Function
     """``reward(cost, grows)``: the reward of a step [-], whose cost is ``Cost``; false if the crystal is lost in it."""
-    equations: tuple[Any, ...]
-    """The functions that define the plant, for :attr:`cz_gym.config.Config.plant_hash`."""
+    points: Function
+    """``points(p)``: a list of (x, u, d) in reach of a crystal. What the plant computes there is hashed
+    (:attr:`cz_gym.config.Config.plant_hash`)."""
     weights: Any
     """The usual weights of the cost's terms, a named tuple of numbers."""
     Extra: Any = NoExtra

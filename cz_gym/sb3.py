@@ -43,8 +43,9 @@ class CzVecEnv(VecEnv):
 
     Observations are float32, shape (num_envs, channels); ``infos`` are empty except for slots whose episode ended: they
     hold ``terminal_observation``, ``TimeLimit.truncated`` and ``episode``: return, length and time, as those of
-    stable-baselines3's ``Monitor``. With ``stagger``, a seed, each slot's first episode is cut (truncated) at a random
-    step, so that slots are not all in the same minute. With ``critic_state`` the plant's true state
+    stable-baselines3's ``Monitor``, and "c", the sum of the steps' ``info["cost"]``. ``cost`` has those of the last
+    step, shape (num_envs,). With ``stagger``, a seed, each slot's first episode is cut (truncated) at a random step, so
+    that slots are not all in the same minute. With ``critic_state`` the plant's true state
     (:class:`cz_gym.body.signals.TrueState`) follows the channels of ``observation="history"``, for a
     policy of :mod:`cz_gym.agents.asymmetric`; the batch needs ``info="all"``.
     """
@@ -65,6 +66,7 @@ class CzVecEnv(VecEnv):
         self._actions = np.zeros((env.num_envs, 2), np.float32)
         self._returns = np.zeros(env.num_envs)
         self._lengths = np.zeros(env.num_envs, np.int64)
+        self.cost, self._costs = np.zeros(env.num_envs), np.zeros(env.num_envs)
         self._began = time.time()
         self._k = 0
         self._cuts = np.zeros(env.num_envs, np.int64)
@@ -76,7 +78,7 @@ class CzVecEnv(VecEnv):
         observation = self._shown(*self.env.reset(seed=list(self._seeds), options=(self._options or [{}])[0] or None))
         self._reset_seeds()
         self._reset_options()
-        self._returns[:] = 0.0
+        self._returns[:] = self._costs[:] = 0.0
         self._lengths[:] = 0
         self._k = 0
         self.reset_infos = [{} for _ in range(self.num_envs)]
@@ -95,6 +97,9 @@ class CzVecEnv(VecEnv):
         self._k += 1
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         done = terminated | truncated
+        if "cost" in info:  # not every process has one
+            self.cost = np.where(done, info["final_info"]["cost"], info["cost"]) if done.any() else info["cost"]
+            self._costs += self.cost
         for i in np.flatnonzero(done).tolist():
             last = self._shown(info["final_obs"][i], {name: of[i] for name, of in info["final_info"].items()})
             infos[i] = self._final(i, last, bool(truncated[i]))
@@ -104,7 +109,7 @@ class CzVecEnv(VecEnv):
                 infos[i] = self._final(i, observation[i].copy(), True)
             observation[cut] = self._shown(*self.env.reset(options={"reset_mask": cut}))[cut]
             done = done | cut
-        self._returns[done] = 0.0
+        self._returns[done] = self._costs[done] = 0.0
         self._lengths[done] = 0
         return observation, reward.astype(np.float32), done, infos
 
@@ -112,7 +117,8 @@ class CzVecEnv(VecEnv):
         return np.concatenate([observation, info["state"]], axis=-1) if self.critic_state else observation
 
     def _final(self, i: int, observation: np.ndarray, truncated: bool) -> dict[str, Any]:
-        episode = {"r": float(self._returns[i]), "l": int(self._lengths[i]), "t": round(time.time() - self._began, 6)}
+        earned = {"r": float(self._returns[i]), "c": float(self._costs[i])}
+        episode = {**earned, "l": int(self._lengths[i]), "t": round(time.time() - self._began, 6)}
         return {"terminal_observation": observation, "TimeLimit.truncated": truncated, "episode": episode}
 
     def close(self) -> None:
@@ -159,7 +165,7 @@ class Slot:
         given = {**(options or {}), "reset_mask": np.arange(n) == i}
         given |= {"state": (given["state"],) * n} if "state" in given else {}
         observation, info = among.env.reset(seed=[seed] * n, options=given)
-        among._returns[i] = among._lengths[i] = 0
+        among._returns[i] = among._costs[i] = among._lengths[i] = 0
         own = {name: values[i] for name, values in info.items() if f"_{name}" in info}
         return among._shown(observation, info)[i], own
 

@@ -7,6 +7,7 @@ and the ``benchmark.json`` that ``benchmark.py --agent NAME=FILE ...`` wrote of 
 import argparse
 import secrets
 import sys
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from cz_gym.agents import OnnxPolicy
 from cz_gym.baselines.registry import CONTROLLERS
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
-from cz_gym.evaluation.contender import Contender, agent
+from cz_gym.evaluation.contender import GROUPS, PLANT, REWARD, STATE, Contender, agent
 from cz_gym.evaluation.files import read_results, to_json
 from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, Row, contract_hash
 from cz_gym.evaluation.report.markdown import summary
@@ -32,7 +33,9 @@ BUDGETS = {"1 M": 1_000_000, "5 M": 5_000_000, "20 M": 20_000_000}
 """Classes of agents by the environment steps of their longest training; the rest is open."""
 OVERSHOOT = 1.05
 """Share of a budget that a training may take: it ends with an update, which may end later."""
-HEADS = ("place", "agent", "budget", "training seeds", "claimed RMSE [mm]", "here", "lost here [%]", "contract")
+HEADS = ("budget", "place", "agent", "told", "training seeds", "claimed RMSE [mm]", "here", "lost here [%]", "contract")
+TOLD = {GROUPS[REWARD]: "nothing", GROUPS[STATE]: "state, in training", GROUPS[PLANT]: "plant, in training"}
+"""What an agent was told, by the heading of its group."""
 Claims = Mapping[str, tuple[float, str]]
 """RMSE [mm] on the first row, and the contract, that each submission claims."""
 
@@ -63,19 +66,21 @@ def submission(folder: Path) -> tuple[Contender, tuple[float, str]]:
 
 
 def page(results: Sequence[Result], claims: Claims, rows: Sequence[Row]) -> str:
-    """The leaderboard in Markdown: agents by their mean RMSE over the scenarios here; losses and claims beside it."""
+    """The leaderboard in Markdown: of each budget its agents by their mean RMSE here; losses and claims beside it."""
     here = {sample.name: sample.contender for sample in results[0].samples if sample.name in claims}
 
     def mean(name: str, metric: str) -> float:
         return sum(result.means[name][metric].mean for result in results) / len(results)
 
-    lines = []
-    for place, name in enumerate(sorted(here, key=lambda name: mean(name, "rmse_mm")), 1):
+    lines, places, order = [], Counter[str](), [*BUDGETS, "open"]
+    for name in sorted(here, key=lambda name: (order.index(budget(here[name])), mean(name, "rmse_mm"))):
+        spent, told = budget(here[name]), TOLD[here[name].knows]
+        places[spent] += 1
         claim, contract = claims[name]
         own = RMSE.text(results[0].means[name][RMSE.metric])
         same = "the same" if contract == contract_hash(rows) else f"other: `{contract or 'unknown'}`"
         seeds, lost = str(len(here[name].training_seeds)), f"{100.0 * mean(name, 'failure_rate'):.2f}"
-        lines.append((str(place), name, budget(here[name]), seeds, f"{claim:.3f}", own, lost, same))
+        lines.append((spent, str(places[spent]), name, told, seeds, f"{claim:.3f}", own, lost, same))
     seeds = f"{rows[0].first_seed} to {results[0].seeds[-1]}"
     about = (
         f"Submitted agents on {len(results[0].seeds)} fresh crystals of each scenario (seeds {seeds}), by mean RMSE. "

@@ -29,7 +29,7 @@ def design_rates(x: np.ndarray, u: Truth, p: Any) -> np.ndarray:
     v_g = (p.Phi_s - Phi_l) / p.rho_dH
     link = p.kappa_12 * (T_1**4 - T_2**4)
     wall = p.G_2b * (T_2 - T_b)
-    kappa_b = p.emission * (p.R_cr**2 - r_c**2)
+    kappa_b = p.emission * np.pi * (p.R_cr**2 - r_c**2)
     return np.array(
         [
             v_g * np.tan(alpha_c),

@@ -61,7 +61,7 @@ class Contract:
     training_seed: int
     """Seed of the training run."""
     training_steps: int
-    """Environment steps of learning."""
+    """Environment steps of learning, those after the agent was chosen too."""
     validation_cost: float
     """Mean cost of a step [-] on the validation episodes that choose no agent."""
     validation_rmse_mm: float

@@ -24,11 +24,12 @@ def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
     """The algorithm of a recipe for a training seed; a resumed one has taken ``done`` steps before."""
     torch.set_num_threads(1)  # small networks are quicker so
     torch.manual_seed(seed)
-    told = isinstance(recipe, Reinforcement)
+    learns = isinstance(recipe, Reinforcement)
+    told = isinstance(recipe, Reinforcement) and recipe.told
     batch = CzVectorEnv.from_config(
         recipe.config, recipe.num_envs, AutoresetMode.SAME_STEP, info="all" if told else "lean"
     )
-    env: VecEnv = CzVecEnv(batch, seed + done if told else None, critic_state=told)
+    env: VecEnv = CzVecEnv(batch, seed + done if learns else None, critic_state=told)
     kind: Any
     policy: Any
     options = dict[str, Any]()
@@ -36,10 +37,11 @@ def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
         case APG():
             kind, policy, options = apg.APG, "RecurrentPolicy", {"betas": recipe.betas}
         case PPO():
-            kind, policy, critics = stable_baselines3.PPO, AsymmetricPolicy, "vf"
+            kind, policy, critics = stable_baselines3.PPO, AsymmetricPolicy if told else "MlpPolicy", "vf"
             options = {"log_std_init": recipe.log_std_init}
         case SAC():
             kind, policy, critics = stable_baselines3.SAC, AsymmetricSACPolicy, "qf"
+            options = {"activation_fn": torch.nn.Tanh}
         case _:
             raise TypeError(f"no algorithm for a {type(recipe).__name__}")
     known = {name for each in kind.__mro__ for name in inspect.signature(each.__init__).parameters}

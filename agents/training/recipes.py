@@ -4,10 +4,16 @@ A new recipe needs a line in :data:`RECIPES`; a new kind needs a dataclass here 
 :func:`.algorithms.make_algorithm`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.user_code import scenarios
+
+LEAST_ENVS, LEAST_BATCH = 8, 64
+"""Least number of crystals at a time, and of samples in a batch, on a small budget."""
+FEW_UPDATES = 50
+"""Number of updates below which nothing is learned."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +38,24 @@ class Recipe:
     puller: str = ""
     """Puller file, or name of a shipped one, which has a control interval of its own; empty: the default puller."""
 
+    fewest_updates: int
+    """Number of updates below which a smaller budget has fewer crystals at a time instead."""
+
+    @property
+    def steps_between(self) -> int:
+        """Environment steps of each crystal between two updates."""
+        raise NotImplementedError
+
+    @property
+    def updates(self) -> int:
+        """Number of updates in the budget."""
+        return self.steps // (self.num_envs * self.steps_between)
+
+    def with_steps(self, steps: int) -> Self:
+        """The recipe on another budget; on a small one with fewer crystals at a time, so that it still learns."""
+        wanted = round(steps / (self.fewest_updates * self.steps_between))
+        return replace(self, steps=steps, num_envs=min(self.num_envs, max(wanted, LEAST_ENVS)))
+
     @property
     def config(self) -> Config:
         """The environment that the recipe's agents act in."""
@@ -46,35 +70,55 @@ class APG(Recipe):
     """Analytic policy gradients: follows the gradient of the cost through policy, memory and plant."""
 
     name: str = "gradient"
-    steps: int = 48_384_000
+    steps: int = 24_192_000
     num_envs: int = 192
     learning_rate: float = 4e-3
     observation: str = "measured"
     action: str = "rate"
     window: int = 180
     """Steps of a crystal that a gradient goes back through."""
+    fewest_updates: int = 400
     betas: tuple[float, float] = (0.9, 0.9)
     """Adam's decays. The first gradients, of lost crystals, are a thousand times those that follow: their squares must
     be forgotten soon."""
+
+    @property
+    def steps_between(self) -> int:
+        """The window."""
+        return self.window
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reinforcement(Recipe):
     """Learns from reward, by trying; stable-baselines3's ``VecNormalize`` scales the reward. Observations are scaled by
     the environment: running means would remember the lost crystals of the first minutes, and make a reading that is
-    not valid, one in hundreds, an input of -10. Critics read the plant's true state
-    (:mod:`cz_gym.agents.asymmetric`); actors never do, but PPO's estimate is fitted to it.
+    not valid, one in hundreds, an input of -10. Critics that are told read the plant's true state
+    (:mod:`cz_gym.agents.asymmetric`); actors never do, but their estimate is fitted to it.
     """
 
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the actor's hidden layers."""
     critic_hidden: tuple[int, ...] = (64, 64)
     """Widths of the critic's hidden layers."""
+    told: bool = True
+    """Whether the true state is told in training."""
     action_repeat: int
     """Environment steps that an action is held for in training: the effect of one of 5 s is lost in the noise."""
     gamma: float = 0.99
     """Discount of an action's steps together."""
     batch_size: int
+    n_steps: int
+    """Actions on each crystal between updates of PPO; actions whose rewards a target of SAC has."""
+
+    @property
+    def steps_between(self) -> int:
+        """PPO's rollout."""
+        return self.action_repeat * self.n_steps
+
+    def with_steps(self, steps: int) -> Self:
+        """As for every recipe; batches become smaller with the rollouts."""
+        fewer = super().with_steps(steps)
+        return replace(fewer, batch_size=max(self.batch_size * fewer.num_envs // self.num_envs, LEAST_BATCH))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +133,7 @@ class PPO(Reinforcement):
     """Many crystals at a time: what an action changes is small beside what the disturbances do."""
     action_repeat: int = 4
     n_steps: int = 64
-    """Actions on each crystal between updates."""
+    fewest_updates: int = 90
     batch_size: int = 4096
     n_epochs: int = 5
     learning_rate: float = 1e-3
@@ -101,14 +145,17 @@ class PPO(Reinforcement):
 
 @dataclass(frozen=True, kw_only=True)
 class SAC(Reinforcement):
-    """Soft actor-critic."""
+    """Soft actor-critic; its actor has PPO's estimate, its critics read products of state and action
+    (:class:`cz_gym.agents.asymmetric.StateCritic`)."""
 
     name: str = "sac"
+    hidden: tuple[int, ...] = (32, 32)
     critic_hidden: tuple[int, ...] = (128, 128)
-    steps: int = 12_000_000
+    steps: int = 5_000_000
     num_envs: int = 256
     action_repeat: int = 4
-    gamma: float = 0.97
+    n_steps: int = 4
+    fewest_updates: int = 4000
     buffer_size: int = 1_000_000
     learning_starts: int = 10_000
     """Actions before the first update."""
@@ -119,9 +166,18 @@ class SAC(Reinforcement):
     tau: float = 0.01
     ent_coef: str = "auto_0.005"
     """Initial weight of the entropy; it adapts."""
+    target_entropy: float = -2.0
+    """Entropy of an action's distribution that the weight adapts to."""
+
+    @property
+    def steps_between(self) -> int:
+        """The steps of an action."""
+        return self.action_repeat
 
 
-RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in (PPO(), SAC(), APG())}
+PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64))
+"""stable-baselines3's own PPO, told nothing: beside ``ppo`` it shows what the true state is worth in training."""
+RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG())}
 """Recipes by name: the choices of ``train.py --algo``."""
 DEFAULT = "ppo"
 """The recipe that train.py follows unless another is named."""

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import configure_logger
 
 from cz_gym.agents.agent_file.contract import agent_files, read_json
-from cz_gym.agents.asymmetric import LearnState
+from cz_gym.agents.asymmetric import Asymmetric, LearnState
 from cz_gym.agents.export import to_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.sb3 import environment_steps
@@ -23,7 +24,7 @@ from cz_gym.support.atomic_files import write_files
 from . import validation
 from .algorithms import make_algorithm, repeat_of
 from .checkpoint import load_checkpoint, restore, to_bytes
-from .recipes import PPO, Recipe
+from .recipes import Recipe
 from .run_files import check_settings, identity, provenance, read_rows, to_csv, to_json
 from .validation import COLUMNS, REFERENCES, References, validate
 
@@ -109,7 +110,7 @@ class Run:
         with deferred_interrupt() as interrupted:
             if self.steps < self.recipe.steps:
                 left = -(-(self.recipe.steps - self.steps) // repeat_of(self.recipe))
-                fits: list[BaseCallback] = [LearnState()] if isinstance(self.recipe, PPO) else []
+                fits: list[BaseCallback] = [LearnState()] if isinstance(self.algorithm.policy, Asymmetric) else []
                 self.algorithm.learn(left, [*fits, _Watch(self, bar, interrupted)], reset_num_timesteps=False)
             if not self.rows or int(self.rows[-1]["steps"]) < self.steps:
                 self.validate(bar)
@@ -138,11 +139,12 @@ class Run:
             **{f"{name}_rmse_mm": judged for name, (_, judged) in self.job.references.items()},
             "pull_step_rms_mm_per_min": figures.pull_step_rms_mm_per_min,
             "failure_rate": figures.failure_rate,
-            "training_steps": agent.contract.training_steps,
+            "chosen_at": agent.contract.training_steps,
             "steps": self.steps,
             "seconds": time.monotonic() - self.began,
         }
-        self._hold(agent_files(path, agent.content, figures.put_into(agent.contract)))
+        whole_run = replace(agent.contract, training_steps=self.steps)
+        self._hold(agent_files(path, agent.content, figures.put_into(whole_run)))
         self._hold({self.folder / "summary.json": to_json(summary)})
         self.save()
         return summary

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from cz_gym.baselines.policy import Floats, MeasuredController
-from cz_gym.body.cost import Weights
+from cz_gym.body.cost import WEIGHTS, Weights
 from cz_gym.body.plant import Puller, make_puller
 from cz_gym.observation import Measured
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
@@ -27,7 +27,7 @@ class LQGDesign:
     """Everything that is chosen about an LQG."""
 
     noise: NoiseModel = field(default_factory=NoiseModel)
-    weights: Weights = Weights(pull=0.5)
+    weights: Weights = WEIGHTS
     """Weights of the regulator's quadratic cost, whose term of the pull speed has no band."""
     lam: float = 0.5
     """Share of conduction at the design point [-]."""

@@ -58,8 +58,9 @@ SENSITIVITY_WEIGHT = 0.02
 """Weight of the relative slack of the sensitivity peak [-]."""
 STEP, STEP_WEIGHT = 0.029, 10.0
 """Limit of the pull step RMS [mm/min], and the weight of its slack [1/(mm/min)]."""
-STEP_PRICE, FAILURE_PRICE, MISS_PRICE = 0.2, 5.0, 2.0
-"""Prices of the pull step RMS [mm per mm/min], of losing every crystal, and of a broken limit [mm]."""
+STEP_PRICE, OUTSIDE_PRICE, FAILURE_PRICE, MISS_PRICE = 0.2, 0.05, 5.0, 2.0
+"""Prices of the pull step RMS [mm per mm/min], of a mean pull speed always out of tolerance, of losing every crystal,
+and of a broken limit [mm]."""
 
 
 @lru_cache(maxsize=4)
@@ -87,8 +88,9 @@ def below_half_the_zero(figures: Figures, policy: FilteredPID) -> float:
 
 
 def priced(figures: Figures) -> float:
-    """The objective of a PID's search: observable RMSE plus priced pull steps and failures [mm]."""
-    return figures.rmse_mm + STEP_PRICE * figures.pull_step + FAILURE_PRICE * figures.failure_rate
+    """The objective of a PID's search: observable RMSE plus priced pull steps, mean pull speed and failures [mm]."""
+    activity = STEP_PRICE * figures.pull_step + OUTSIDE_PRICE * figures.pull_outside
+    return figures.rmse_mm + activity + FAILURE_PRICE * figures.failure_rate
 
 
 def pid_goal(

@@ -62,6 +62,8 @@ class Figures(NamedTuple):
     """Pull step RMS [mm/min]; at other control intervals than 5 s, that of steps of the same slope over 5 s."""
     heater_step: float
     """Heater step RMS [kW], likewise."""
+    pull_outside: float
+    """Share of time in which the 30 min mean of the pull speed is off nominal by more than 3 % [-]."""
     mean_return: float
     failure_rate: float
     steps: int

@@ -57,6 +57,7 @@ def measure(policy: Any, config: Config, seeds: Sequence[int]) -> Figures:
         means.rmse_observable_mm.mean(),
         per_step * means.pull_step_rms_mm_per_min.mean(),
         per_step * means.heater_step_rms_kw.mean(),
+        1.0 - means.mean_pull_within_3pct.mean(),
         means.return_.mean(),
         means.failure_rate.mean(),
     )

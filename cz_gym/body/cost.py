@@ -90,7 +90,7 @@ def cost_slopes(at: Any, weights: Any = WEIGHTS) -> Any:
 
 @jittable
 def outside(radius_error: Any, pull: Any) -> Any:
-    """1 where a crystal leaves its quality: true radius error [m] or mean pull speed, relative [-], out of tolerance."""
+    """1 where true radius error [m] or mean pull speed, relative [-], is out of tolerance; else 0."""
     return 1.0 * ((np.abs(radius_error) > TOLERANCE) | (np.abs(pull) > PULL_TOLERANCE))
 
 

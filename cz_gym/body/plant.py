@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.engine.arithmetic import rk4 as runge_kutta
 from cz_gym.episodes.schedule import drift, melt_left
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import force_inlined, jittable
+from cz_gym.physics.arithmetic import rk4 as runge_kutta
 from cz_gym.physics.meniscus import HURLE, MeniscusModel, ring_point
 from cz_gym.physics.parameters import Parameters, check_parameters
 from cz_gym.process import NO_OPERATING_POINT
@@ -103,7 +103,7 @@ class Puller(NamedTuple):
     G_2b: float
     """Conductance of the quartz wall [W/K]."""
     emission: float
-    """Radiation of a melt surface of one square metre times pi, pi eps sigma_SB [W/m2/K4]."""
+    """Radiation of the melt surface, eps sigma_SB [W/m2/K4]."""
     R_cr: float
     """Radius of the crucible [m]."""
     T_e: float
@@ -158,10 +158,11 @@ def derive_puller(q: Any, lam: Any, height: Any, ring_offset: Any) -> Any:
     Phi_l_0 = q.k_l * q.dT_0 / h_0
     rho_dH = q.rho_s * q.dH
     Phi_s = Phi_l_0 + rho_dH * q.v_0
-    emission = math.pi * q.eps * q.sigma_SB
+    emission = q.eps * q.sigma_SB
     T_b_0 = q.T_m + q.dT_0
-    surface = emission * (q.R_cr * q.R_cr - q.r_0 * q.r_0) * (T_b_0**4 - q.T_e**4)
-    through = surface + math.pi * q.r_0 * q.r_0 * Phi_l_0
+    covered = math.pi * q.r_0 * q.r_0
+    surface_loss = emission * (math.pi * q.R_cr * q.R_cr - covered) * (T_b_0**4 - q.T_e**4)
+    through = surface_loss + covered * Phi_l_0
     T_2_0 = T_b_0 + through / q.G_2b
     T_1_0 = np.sqrt(np.sqrt(T_2_0**4 + through / q.kappa_12))
     Q_H_0 = through + q.G_1a * (T_1_0 - q.T_a)
@@ -242,9 +243,10 @@ def heating(x: Any, u: Any, p: Any, G_2b: Any, Phi_l: Any) -> Any:
     """:class:`Heating` through a wall of this conductance [W/K], with this flux into the interface [W/m2]."""
     radiated = p.kappa_12 * (fourth_power(x.T_1) - fourth_power(x.T_2))
     into_melt = G_2b * (x.T_2 - x.T_b)
-    crystal = x.r_c * x.r_c
-    surface_loss = p.emission * (p.R_cr * p.R_cr - crystal) * (fourth_power(x.T_b) - fourth_power(p.T_e))
-    into_crystal = math.pi * crystal * Phi_l
+    covered = math.pi * x.r_c * x.r_c
+    open_surface = math.pi * p.R_cr * p.R_cr - covered
+    surface_loss = p.emission * open_surface * (fourth_power(x.T_b) - fourth_power(p.T_e))
+    into_crystal = covered * Phi_l
     return Heating(
         (u.Q_H - radiated - p.G_1a * (x.T_1 - p.T_a)) / p.C_1,
         (radiated - into_melt) / p.C_2,
@@ -278,7 +280,3 @@ def hidden_load(p_drift: Any, p: Any) -> Any:
 def disturbance(t: Any, dT_i: Any, e: Any, p: Any) -> Disturbance:
     """Disturbance at a point t [s] of the 5 s grid, with the interface fluctuation [K] drawn there."""
     return Disturbance(hidden_load(drift(t, e), p), dT_i, melt_left(t, e))
-
-
-EQUATIONS = (derive_puller, rates, rk4, hidden_load)
-"""The functions that define the plant, for :attr:`cz_gym.config.Config.plant_hash`."""

@@ -139,6 +139,19 @@ def charged(x: Any, u: Any, before: Any, extra: Any, slot: Any, t: Any) -> Any:
     return cost.Cost(error, extra.v_p_mean / p.v_0 - 1.0, u.v_p - before.v_p, u.Q_H - before.Q_H)
 
 
+def points(p: Puller) -> list[tuple[State, Inputs, Disturbance]]:
+    """Three crystals off their operating point, with drives and disturbances off nominal."""
+    sides = ((1.02, 0.9, 4.0, 0.3), (0.97, 1.1, -3.0, -0.5), (1.0, 1.3, 9.0, 1.1))
+    return [
+        (
+            State(wide * p.r_0, high * p.h_0, p.T_1_0 + warm, p.T_2_0 + 0.5 * warm, p.T_b_0 + 0.2 * warm),
+            Inputs(wide * p.v_0, high * p.Q_H_0),
+            Disturbance(100.0 * warm, dT_i, 0.9),
+        )
+        for wide, high, warm, dT_i in sides
+    ]
+
+
 BODY = Process(
     Constants=Puller,
     State=State,
@@ -167,7 +180,7 @@ BODY = Process(
     cost_terms=cost.cost_terms,
     cost_slopes=cost.cost_slopes,
     reward=cost.reward,
-    equations=plant.EQUATIONS,
+    points=points,
     weights=cost.WEIGHTS,
     Extra=Extra,
     carry=carry,

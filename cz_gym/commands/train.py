@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from cz_gym.agents.training.recipes import DEFAULT, RECIPES, Recipe
+from cz_gym.agents.training.recipes import DEFAULT, FEW_UPDATES, RECIPES, Recipe
 from cz_gym.agents.training.run_files import read_settings
 from cz_gym.baselines.registry import make_controller
 from cz_gym.config import check_config
@@ -77,6 +77,8 @@ def train(arguments: argparse.Namespace) -> int:
     jobs = [Job(folder, recipe, seed, *options) for folder, seed in zip(folders, seeds, strict=True)]
     what = f"{len(jobs)} seeds" if arguments.seeds else f"seed {seed}, {recipe.steps:,} steps"
     machine = f", puller {recipe.config.puller.label}" if recipe.puller else ""
+    if recipe.updates < FEW_UPDATES:
+        print(f"{recipe.steps:,} steps are {recipe.updates} updates of {recipe.name}: too few to learn from")
     print(f"{recipe.name}, {what} on {recipe.config.scenario.name}{machine}, into {arguments.out}")
     if not arguments.seeds:
         with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, disable=None) as bar:
@@ -115,7 +117,9 @@ def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tupl
         "scenario": arguments.scenario or settings.get("scenario"),
         "puller": arguments.puller or settings.get("puller"),
     }
-    recipe = replace(RECIPES[name], **{field: value for field, value in chosen.items() if value})
+    begun_with = {field: settings[field] for field in ("num_envs", "batch_size") if field in settings}
+    recipe = replace(RECIPES[name].with_steps(chosen.pop("steps") or RECIPES[name].steps), **begun_with)
+    recipe = replace(recipe, **{field: value for field, value in chosen.items() if value})
     chosen_puller(recipe.puller or None)
     check_config(recipe.config)
     return recipe, saved.get("seed", 0) if arguments.seed is None else arguments.seed

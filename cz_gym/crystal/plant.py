@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.body.plant import Puller, derive_puller, heating, hidden_load, interface
+from cz_gym.body.plant import Puller, derive_puller, heating, interface
 from cz_gym.episodes.draw import randomised
 from cz_gym.jit.compile import force_inlined, jittable, joined
 
@@ -183,7 +183,3 @@ def rates(x: Any, u: Any, d: Any, p: Any, m: Any) -> Any:
         M_s_dot,
         -p.k_0 * x.N / left * M_s_dot,
     )
-
-
-EQUATIONS = (derive, rates, hidden_load)
-"""The functions that define the plant, for :attr:`cz_gym.config.Config.plant_hash`."""

@@ -163,6 +163,20 @@ def charged(x: Any, u: Any, before: Any, extra: Any, slot: Any, t: Any) -> Any:
     return cost.Cost(error, extra.v_p_mean / p.v_0, u.v_p - before.v_p, u.Q_H - before.Q_H)
 
 
+def points(p: Any) -> list[tuple[State, Inputs, Disturbance]]:
+    """Crystals off the body's operating point, at four lengths, with drives and disturbances off nominal."""
+    sides = ((0.15, 0.8, 0.0, 9.0), (0.7, 0.4, 0.2, 4.0), (1.02, 0.9, 0.5, -3.0), (0.5, 1.2, 0.9, 6.0))
+    return [
+        (
+            State(wide * p.r_0, high * p.h_0, p.T_1_0 + warm, p.T_2_0 + warm, p.T_b_0 + 0.2 * warm, share * task.end(p),
+                  0.02 + share, 0.7 * share * p.M_0, 1.0 - 0.6 * share),
+            Inputs(wide * p.v_0, high * p.Q_H_0),
+            Disturbance(100.0 * warm, 0.1 * warm),
+        )
+        for wide, high, share, warm in sides
+    ]  # fmt: skip
+
+
 CRYSTAL = Process(
     Constants=plant.Crystal,
     State=State,
@@ -191,7 +205,7 @@ CRYSTAL = Process(
     cost_terms=cost.cost_terms,
     cost_slopes=cost.cost_slopes,
     reward=cost.reward,
-    equations=(*plant.EQUATIONS, recipe.fill),
+    points=points,
     weights=cost.WEIGHTS,
     Extra=Extra,
     carry=carry,

@@ -130,7 +130,7 @@ def _balance(table: Any, row: Any, p: Any, e: Any, dL: Any, m: Any) -> None:
     Phi_l = Phi_s - p.rho_dH * at.v_g
     T_b = p.T_m + Phi_l / (p.k_l * (p.lam / h_c + (1.0 - p.lam) / p.h_0))
     area = math.pi * at.r * at.r
-    surface = p.emission * (p.R_cr * p.R_cr - at.r * at.r) * (fourth_power(T_b) - fourth_power(p.T_e))
+    surface = p.emission * (math.pi * p.R_cr * p.R_cr - area) * (fourth_power(T_b) - fourth_power(p.T_e))
     leaves = p.C_b / p.M_0 * (T_b - p.T_m) * p.rho_s * area * at.v_g
     table[row, _h_c], table[row, _ring], table[row, _M_men] = h_c, m.ring_offset(at.r, h_c, p), M_men
     table[row, _v_p], table[row, _Phi_s], table[row, _T_b] = at.v_g * (1.0 + rises), Phi_s, T_b

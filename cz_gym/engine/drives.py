@@ -5,9 +5,8 @@ from typing import Any
 import numpy as np
 
 from cz_gym.jit.compile import force_inlined, jittable, labelled, set_labelled
+from cz_gym.physics.arithmetic import clip
 from cz_gym.process import Inputs
-
-from .arithmetic import clip
 
 _EPS, _POWER = 1e-9, 3
 

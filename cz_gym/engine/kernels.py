@@ -13,10 +13,10 @@ from cz_gym.episodes.draw import draw_episode, draw_factors, draw_scenario, seed
 from cz_gym.episodes.noise import first_fluctuation, fluctuation, sample_noise
 from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import fetch, inlined, jittable, kernel, labelled, set_labelled
+from cz_gym.physics.arithmetic import along
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.process import GROWS, LOST, Inputs, Process
 
-from .arithmetic import along
 from .drives import drive
 from .layout import model_of
 from .lockstep import LANES, advance

@@ -11,9 +11,9 @@ from cz_gym.episodes.noise import fluctuation, next_fluctuation
 from cz_gym.episodes.record import GRID
 from cz_gym.episodes.schedule import drift
 from cz_gym.jit.compile import column, inlined, jittable, scratch, set_column, set_labelled
+from cz_gym.physics.arithmetic import rk4
 from cz_gym.process import GROWS, Inputs
 
-from .arithmetic import rk4
 from .drives import is_slow, mean_power
 from .sensors import photograph
 

@@ -4,8 +4,7 @@ from typing import Any
 
 from cz_gym.jit.compile import jittable, scratch
 from cz_gym.observation import CLIP, INTEGRAL_SCALE
-
-from .arithmetic import clip
+from cz_gym.physics.arithmetic import clip
 
 
 @jittable

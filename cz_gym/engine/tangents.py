@@ -11,10 +11,10 @@ from typing import Any
 from cz_gym.episodes.record import GRID
 from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import column, compiled_as, jittable, kernel, labelled, scratch, set_column
+from cz_gym.physics.arithmetic import along, plus_product, rk4
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.process import Inputs, Process, Seen
 
-from .arithmetic import along, plus_product, rk4
 from .drives import next_inputs
 from .layout import model_of
 
@@ -99,7 +99,7 @@ def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, m
 
 @jittable
 def rk4_by(work: Any, x: Any, u: Any, d: Any, p: Any, dt: Any, model: Any) -> None:
-    """Derivatives of :func:`cz_gym.engine.arithmetic.rk4` by state and inputs, into ``work[3]``."""
+    """Derivatives of :func:`cz_gym.physics.arithmetic.rk4` by state and inputs, into ``work[3]``."""
     for i in range(model.states):
         for j in range(model.extra):
             work[1, i, j], work[3, i, j] = 0.0, 1.0 if i == j else 0.0

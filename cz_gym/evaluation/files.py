@@ -101,10 +101,13 @@ def to_json(results: Sequence[Result], command: str) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Estimates as dictionaries, at any depth of a mapping."""
+    """Estimates as dictionaries, at any depth of a mapping; what does not apply, NaN, as None."""
     if isinstance(value, Mapping):
         return {name: _plain(each) for name, each in value.items()}
-    return value._asdict() if isinstance(value, Estimate) else value
+    if isinstance(value, Estimate):
+        applies = value.mean == value.mean
+        return value._asdict() if applies else {"mean": None, "ci95": None, "n": value.n}
+    return value
 
 
 def _gaps(results: Sequence[Result], metric: str) -> dict[str, Any]:

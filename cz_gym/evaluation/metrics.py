@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.body.cost import PULL_TOLERANCE, TOLERANCE
+from cz_gym.body.cost import COST_CAP, PULL_TOLERANCE, TOLERANCE
 from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .rollout import Rollout
@@ -28,6 +28,8 @@ class Metrics(NamedTuple):
 
     rmse_mm: Floats
     """Root mean square of r_c - r_ref [mm]."""
+    rmse_survivors_mm: Floats
+    """The same of a crystal that is not lost; NaN if it is [mm]."""
     rmse_observable_mm: Floats
     """Root mean square of r_c against r_ref minus the ring offset that no sensor shows [mm]."""
     max_error_mm: Floats
@@ -54,7 +56,11 @@ class Metrics(NamedTuple):
     """1 if the episode failed, else 0 [-]."""
     # ``return`` is not a Python name; metric_names() restores it.
     return_: Floats
-    """Sum of rewards [-]."""
+    """Sum of rewards; each step that a lost crystal has left of its horizon counts as the worst one, 1 - 10 [-].
+
+    Otherwise a crystal that is lost at once would earn more than one that is held badly for hours. The environment's
+    own reward has no such charge.
+    """
 
 
 def metric_names() -> tuple[str, ...]:
@@ -73,9 +79,10 @@ def metrics(run: Rollout) -> Metrics:
     pull_step = np.diff(s.v_p, axis=0, prepend=run.start.v_p)
     heater_step = np.diff(s.Q_H, axis=0, prepend=run.start.Q_H)
     terms = sum(getattr(s, f"term_{name}") for name in process.Cost._fields)
-    largest = process.cost_terms(process.Cost(observable, 0.0, 0.0, 0.0), process.weights)
+    largest = process.cost_terms(process.Cost(observable, 0.0, 0.0, 0.0), run.config.weights)
     return Metrics(
         rmse_mm=_rms(error, counts) / MM,
+        rmse_survivors_mm=np.where(run.failed, np.nan, _rms(error, counts) / MM),
         rmse_observable_mm=_rms(observable, counts) / MM,
         max_error_mm=np.abs(error).max(axis=0, where=counts, initial=0.0) / MM,
         within_half_mm=np.mean(np.abs(error) <= TOLERANCE, axis=0, where=counts),
@@ -88,7 +95,7 @@ def metrics(run: Rollout) -> Metrics:
         ground_off_pct=_ground_off(value, alive),
         cost=np.where(lost, largest[0], terms).mean(axis=0, where=counts),
         failure_rate=run.failed.astype(np.float64),
-        return_=run.reward.sum(axis=0),
+        return_=run.reward.sum(axis=0, where=alive) + (1.0 - COST_CAP) * (lost & ~alive).sum(axis=0),
     )
 
 

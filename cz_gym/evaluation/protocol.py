@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from cz_gym.body.cost import PULL_TOLERANCE, TOLERANCE
 from cz_gym.body.process import BODY
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Scenario
@@ -142,7 +143,11 @@ def find_row(name: str) -> Row:
 
 
 def contract_hash(rows: Sequence[Row]) -> str:
-    """Return the hash of what figures rest on: plant, scenarios, control interval and horizon of the random rows."""
-    random = [row for row in rows if not find_scenario(row.scenario).deterministic]
-    parts = sorted(row.config().hash for row in random or rows)
+    """The hash of what figures rest on: plant, scenarios, interval, horizon of the random rows; reward and metrics."""
+    from .metrics import ALMOST, PULL_WINDOW, metric_names
+
+    random = [row.config() for row in rows if not find_scenario(row.scenario).deterministic]
+    configs = random or [row.config() for row in rows]
+    parts = [*sorted(config.hash for config in configs), configs[0].reward_hash, *metric_names()]
+    parts += [str(number) for number in (PULL_WINDOW, PULL_TOLERANCE, TOLERANCE, ALMOST)]
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:12]

@@ -66,8 +66,15 @@ def _weights(items: int, count: int, random: np.random.Generator) -> Floats:
 
 
 def means(values: Floats, resamples: Resamples) -> tuple[Estimate, ...]:
-    """Estimate the mean of each metric over seeds and episodes."""
-    return _estimates(values.mean(axis=(0, 1)), resampled_means(values, resamples), values.shape[:2])
+    """Estimate the mean of each metric over seeds and episodes; where it is NaN it does not apply, and is left out."""
+    known = np.isfinite(values)
+    if known.all():
+        return _estimates(values.mean(axis=(0, 1)), resampled_means(values, resamples), values.shape[:2])
+    numbers, counted = np.where(known, values, 0.0), known.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        point = numbers.sum(axis=(0, 1)) / counted.sum(axis=(0, 1))
+        spread = resampled_means(numbers, resamples) / resampled_means(counted, resamples)
+    return _estimates(point, spread, values.shape[:2])
 
 
 def differences(values: Floats, reference: Floats, resamples: Resamples) -> tuple[Estimate, ...]:

@@ -25,7 +25,7 @@ SMALLEST, LARGEST = 360, 3840
 
 
 def declared_modes(process: Process = BODY) -> list[str]:
-    """The render modes that can be drawn here: none without pygame, and only a crystal's body, whose radius is known."""
+    """The render modes that can be drawn here: none without pygame, and those of a crystal's body alone."""
     return list(MODES) if available() and set(process.info) >= DRAWN and not process.table[0] else []
 
 

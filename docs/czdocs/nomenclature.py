@@ -16,6 +16,8 @@ PHYSICS = Path(__file__).parents[1] / "physics.md"
 GREEK = frozenset({"alpha", "kappa", "lam", "lambda", "phi", "rho", "sigma", "theta", "Phi"})
 UNLIKE = {
     "eps": r"\varepsilon",
+    "emission": r"\varepsilon \, \sigma_{SB}",
+    "v_p_mean": r"\bar{v}_p",
     "lam": r"\lambda",
     "X_b": r"\xi_b",
     "ring_bias": r"b",
@@ -27,7 +29,7 @@ UNLIKE = {
 }
 """Symbols that do not follow from their names."""
 FORMULA = re.compile(r"\$\$((?:(?!\$\$).)*)\\tag\{(\d+)\}\s*\$\$", re.DOTALL)
-WITHOUT_SYMBOL = frozenset({"action_clipped", "r_br_measured"})
+WITHOUT_SYMBOL = frozenset({"action_clipped", "cost", "r_br_measured"})
 
 
 class Row(NamedTuple):
@@ -84,7 +86,7 @@ def seen() -> list[Row]:
     return [
         _row(row.name, row.unit, row.meaning)
         for row in INFO_ROWS
-        if row.name not in known and not row.name.startswith("cost_")
+        if row.name not in known and not row.name.startswith("term_")
     ]
 
 

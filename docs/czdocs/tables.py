@@ -51,8 +51,9 @@ def units(text: str) -> str:
 
 def channels(listed: Iterable[Channel]) -> list[str]:
     """A table of observation channels."""
+    scales = {"v_p": "$v_0$", "v_p_mean": "$v_0 / 20$"}
     rows = (
-        (str(i), code(c.name), units(c.unit), "$v_0$" if c.name == "v_p" else f"{c.scale:g}", c.meaning)
+        (str(i), code(c.name), units(c.unit), scales.get(c.name, f"{c.scale:g}"), c.meaning)
         for i, c in enumerate(listed)
     )
     return markdown(("index", "name", "unit", "scale", "meaning"), rows)

@@ -225,7 +225,7 @@ def test_usual_layers_act_alike_in_torch_in_the_file_and_in_its_export(layer, tm
     assert agent.predict(seen)[0] == pytest.approx(wanted, abs=1e-5)
     network = network_of(content)
     assert network(observation=seen.astype(np.float64))[0] == pytest.approx(wanted, abs=1e-5)
-    assert network(observation=Graph().input("observation", (1, 72)))[0].shape == (1, 2)
+    assert network(observation=Graph().input("observation", (1, 73)))[0].shape == (1, 2)
 
 
 def test_a_file_that_would_act_otherwise_is_not_written(tmp_path):
@@ -244,7 +244,7 @@ def test_a_file_that_would_act_otherwise_is_not_written(tmp_path):
         ("broken.zip --algo ppo --out mine.onnx", "broken.zip: not a model of ppo"),
         ("good.zip --algo sac --out mine.onnx", "good.zip: not a model of sac"),
         ("good.zip --algo ppo --out mine.pt", "ends in .onnx"),
-        ("good.zip --algo ppo --out mine.onnx --observation measured", "shape (72,)"),
+        ("good.zip --algo ppo --out mine.onnx --observation measured", "shape (73,)"),
         ("good.zip --algo ppo --out mine.onnx --vecnormalize broken.zip", "broken.zip: not a VecNormalize"),
         ("good.zip --algo ppo --out mine.onnx --seed -1", "training_seed"),
     ],

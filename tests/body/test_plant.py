@@ -10,6 +10,7 @@ from cz_gym import SCENARIOS, CzEnv, Parameters, State, make_puller
 from cz_gym.body.plant import NO_DISTURBANCE, Disturbance, Inputs, disturbance, growth, hidden_load, rates, rk4
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.jit.compile import kernel
+from cz_gym.physics.linearisation import jacobian
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.support.units import HOUR
 from tests.equations import Truth, design_rates, drawn, fields, hold, integrated
@@ -57,6 +58,36 @@ def test_rates_are_the_equations_of_the_design(lam, states, rng):
     expected = design_rates(np.array(states), Truth(u.v_p, u.Q_H, d.Q_d, d.dT_i, d.melt), p)
     actual = np.array(rates(states, u, d, p, hurle_slope))
     np.testing.assert_allclose(actual, expected, rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize("lam", MIXES)
+def test_no_heat_appears_or_disappears(lam, states, rng):
+    """Heater and latent heat in, insulation, surface and crystal out, the rest stored: none of it from ``rates``."""
+    q, p = Parameters(), make_puller(lam=lam)
+    u, d = drawn_inputs(rng, p, 200)
+    rate, grown = rates(states, u, d, p, hurle_slope), growth(states, d, p, hurle_slope)
+    crystal = np.pi * states.r_c**2
+    surface = q.eps * q.sigma_SB * (np.pi * q.R_cr**2 - crystal) * (states.T_b**4 - q.T_e**4)
+    into_crystal = crystal * (p.Phi_s - q.rho_s * q.dH * grown.v_g)
+    stored = q.C_1 * rate.T_1 + q.C_2 * rate.T_2 + q.C_b * d.melt * rate.T_b
+    out = q.G_1a * (states.T_1 - q.T_a) + surface + into_crystal + stored
+    np.testing.assert_allclose(out, u.Q_H + d.Q_d, rtol=1e-12)
+
+
+def test_the_crystal_halves_what_a_hotter_heater_does_to_the_melt():
+    """Static change of T_b by that of T_1, radius and height held; heat flows through two links in a row."""
+    q, p = Parameters(), make_puller()
+    r_c, h_c, *hot = p.state_0
+    by = jacobian(lambda *T: rates(State(r_c, h_c, *T), p.inputs_0, NO_DISTURBANCE, p, hurle_slope)[3:], hot)
+    response = np.linalg.solve(by[:, 1:], -by[:, 0])[1]
+    radiates = 4.0 * q.kappa_12 * np.array([p.T_1_0, p.T_2_0]) ** 3
+    surface = 4.0 * np.pi * q.eps * q.sigma_SB * (q.R_cr**2 - q.r_0**2) * p.T_b_0**3
+
+    def static(loss):
+        return radiates[0] / (radiates[1] + loss * (1.0 + radiates[1] / q.G_2b))
+
+    assert response == pytest.approx(static(surface + np.pi * q.r_0**2 * q.k_l / p.h_0), rel=1e-10)
+    assert (round(response, 2), round(static(surface), 2)) == (0.37, 0.79)
 
 
 def test_compiled_equations_equal_the_plain_ones(states, rng):

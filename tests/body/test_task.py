@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cz_gym import CzEnv, make_puller
-from cz_gym.body.cost import cost_terms, reward
+from cz_gym.body.cost import Cost, cost_terms, reward
 from cz_gym.body.task import within_limits
 from tests.observed import PLAIN
 
@@ -13,9 +13,9 @@ MM, MM_PER_MIN = 1e-3, 1e-3 / 60
 P = make_puller()
 
 
-@given(st.floats(0, 8e-3), st.floats(1e-6, 1e-3), st.floats(-4e-5, 4e-5), st.floats(-2e4, 2e4))
+@given(st.floats(0, 8e-3), st.floats(1e-6, 1e-3), st.floats(-1.0, 1.0), st.floats(-2e4, 2e4))
 def test_reward_saturates_and_is_never_flat(error, more, pull, heater):
-    near, far = (reward(cost_terms(e, pull, pull, heater), True) for e in (error, error + more))
+    near, far = (reward(cost_terms(Cost(e, pull, 4e-5 * pull, heater)), True) for e in (error, error + more))
     assert -9.0 < far < near <= 1.0
 
 
@@ -32,7 +32,7 @@ def test_a_crystal_grows_within_its_limits_alone():
 @given(st.floats(0.0, 0.99), st.floats(0.0, 1e12))
 def test_a_failing_step_earns_less_than_the_worst_life(discount, cost):
     """A failing step earns no more than the worst life without an end, discounted."""
-    zero = cost_terms(0.0, 0.0, 0.0, 0.0)
+    zero = Cost(0.0, 0.0, 0.0, 0.0)
     worst = reward(zero._replace(radius=cost), True)
     assert reward(zero, False) <= worst / (1.0 - discount)
 

@@ -15,10 +15,10 @@ from cz_gym.crystal.parameters import complete
 from cz_gym.crystal.plant import Disturbance, State, at_interface, rates
 from cz_gym.crystal.process import nominal_recipe
 from cz_gym.crystal.shape import shape_at
-from cz_gym.engine.arithmetic import rk4
 from cz_gym.episodes.record import Episode, Factors
 from cz_gym.episodes.schedule import melt_left
 from cz_gym.machine.puller import DEFAULT
+from cz_gym.physics.arithmetic import rk4
 from cz_gym.physics.meniscus import HURLE, hurle_height, hurle_slope
 from cz_gym.process import Inputs
 from cz_gym.support.units import MM
@@ -63,7 +63,7 @@ class Audit(NamedTuple):
 def audited(x, u, d, p, m):
     rate = rates(State(*x[:9]), u, d, p, m)
     Phi_l = at_interface(x, d, p, m.slope).Phi_l
-    surface = p.emission * (p.R_cr**2 - x.r_c**2) * (x.T_b**4 - p.T_e**4)
+    surface = p.emission * math.pi * (p.R_cr**2 - x.r_c**2) * (x.T_b**4 - p.T_e**4)
     gain = u.Q_H - p.G_1a * (x.T_1 - p.T_a) - surface - math.pi * x.r_c**2 * Phi_l + d.Q_d
     return Audit(*rate, gain)
 

@@ -141,8 +141,9 @@ TANK = Process(
     rates=rates, accept=accept, see=jittable(lambda x, p, m: Seen(x.h, x.h, 0.0 * x.h, x.T)), measure=measure,
     true_state=jittable(lambda slot, seen, t: Truth(slot.x.h - slot.puller.h_0, slot.x.T - slot.puller.T_0)),
     logged=logged, lean=jittable(lambda slot, seen: Lean(slot.x.h, slot.puller.h_0 + seen.h_ref)), charged=charged,
-    cost_terms=cost_terms, cost_slopes=cost_slopes, reward=reward, equations=(derive, rates), Extra=Extra, weights=WEIGHTS,
-    carry=jittable(lambda extra, u, slot, interval: Extra(extra.fed + u.v_p * interval)), table=(3, 2),
+    cost_terms=cost_terms, cost_slopes=cost_slopes, reward=reward, Extra=Extra,
+    points=lambda p: [(Level(0.9 * p.h_0, p.T_0 + 5.0), Inputs(p.v_0, 100.0), Load(3.0))],
+    weights=WEIGHTS, carry=jittable(lambda extra, u, slot, interval: Extra(extra.fed + u.v_p * interval)), table=(3, 2),
 )  # fmt: skip
 # The end of the process.
 

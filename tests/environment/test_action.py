@@ -49,7 +49,7 @@ def test_rates_add_up_within_the_range_of_the_drives(interval):
 
 def test_info_is_lean_unless_all_is_asked_for():
     for env, keys in (
-        (CzEnv(), {"r_c", "r_ref"}),
+        (CzEnv(), {"r_c", "r_ref", "cost"}),
         (CzEnv(info="all"), {*Logged._fields, "state"}),
         (CzEnv(info="all", observation="measured"), set(Logged._fields)),
     ):

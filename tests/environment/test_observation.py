@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -30,11 +31,11 @@ def column(infos, name):
 
 
 def test_every_channel_is_documented():
-    assert [len(channels) for channels in OBSERVATIONS.values()] == [11, 72, 17]
+    assert [len(channels) for channels in OBSERVATIONS.values()] == [12, 73, 18]
     for channels in OBSERVATIONS.values():
         assert len({channel.name for channel in channels}) == len(channels)
         assert all(channel.unit and channel.meaning and channel.scale > 0 for channel in channels)
-    assert [channel.name for channel in HISTORY[:11]] == [channel.name for channel in MEASURED]
+    assert [channel.name for channel in HISTORY[:12]] == [channel.name for channel in MEASURED]
 
 
 @pytest.mark.parametrize("scenario", ["randomized", "puller", "sensor-fault"])
@@ -51,6 +52,13 @@ def test_measured_holds_what_the_control_computer_has_and_nothing_else(scenario)
     np.testing.assert_allclose(seen.T_1_ref, column(infos, "T_1_ref") - nominal["T_1_0"], atol=1e-5)
     np.testing.assert_allclose(seen.v_p, column(infos, "v_p") - nominal["v_0"], atol=1e-11)
     np.testing.assert_allclose(seen.Q_H, column(infos, "Q_H") - nominal["Q_H_0"], atol=1e-2)
+    mean, means = 0.0, [0.0]
+    for v_p in column(infos, "v_p")[1:] - nominal["v_0"]:
+        mean = math.exp(-5.0 / 1800.0) * mean + (1.0 - math.exp(-5.0 / 1800.0)) * v_p
+        means.append(mean)
+    np.testing.assert_allclose(column(infos, "v_p_mean") - nominal["v_0"], means, atol=1e-17)
+    np.testing.assert_allclose(seen.v_p_mean, means, rtol=1e-6, atol=1e-15)
+    assert np.ptp(means) > 1e-3 * nominal["v_0"]
     t = 5.0 * np.arange(401)
     e = fields(start.slot["episode"])
     drift = np.array([pyrometer_drift(now, e) for now in t])
@@ -99,7 +107,7 @@ def test_history_is_differences_of_past_means_and_the_integral(interval):
     for name, mine, its in zip(told._fields, told, known, strict=True):
         np.testing.assert_allclose(mine, its, rtol=1e-5, atol=1e-6 * max(own[name], 1e-9), err_msg=name)
     steps = np.clip(rows[1:, 0].astype(float), -10, 10) * interval / 1000
-    np.testing.assert_allclose(rows[1:, 11], np.cumsum(steps), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(rows[1:, 12], np.cumsum(steps), rtol=1e-4, atol=1e-5)
 
 
 def test_the_observation_state_is_that_of_the_plant():
@@ -175,10 +183,10 @@ def test_observations_are_clipped_not_lost():
 
 
 def test_decode_takes_any_batch_and_refuses_other_shapes(rng):
-    batch = rng.normal(size=(4, 3, 72))
+    batch = rng.normal(size=(4, 3, 73))
     assert decode(batch).T_1.shape == (4, 3)
     np.testing.assert_allclose(decode(batch).T_1, 5.0 * batch[..., 5] + 2.0 * batch[..., 8])
-    np.testing.assert_allclose(decode(batch[..., :11]).T_1, 5.0 * batch[..., 8])
-    for wrong in (np.zeros(17), np.zeros(()), np.zeros((11, 2))):
+    np.testing.assert_allclose(decode(batch[..., :12]).T_1, 5.0 * batch[..., 8])
+    for wrong in (np.zeros(18), np.zeros(()), np.zeros((12, 2))):
         with pytest.raises(ValueError, match="expected an observation"):
             decode(wrong)

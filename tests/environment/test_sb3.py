@@ -30,6 +30,7 @@ def test_the_adapter_equals_sb3s_own_vector_of_scalars():
         env.seed(5)
     np.testing.assert_array_equal(ours.reset(), theirs.reset())
     failed = truncated = 0
+    costs, sums = np.zeros(N), []
     for _ in range(90):
         actions = rng.uniform(-0.1, 0.1, (N, 2)).astype(np.float32)
         actions[0] = 1.0
@@ -37,6 +38,9 @@ def test_the_adapter_equals_sb3s_own_vector_of_scalars():
         for a, b in zip(one[:3], other[:3], strict=True):
             np.testing.assert_array_equal(a, b)
             assert a.dtype == b.dtype
+        costs += [its["cost"] for its in other[3]]
+        sums += [(mine["episode"]["c"], cost) for mine, cost in zip(one[3], costs, strict=True) if mine]
+        costs[one[2]] = 0.0
         for done, mine, its in zip(one[2], one[3], other[3], strict=True):
             assert ("terminal_observation" in mine) == bool(done)
             if done:
@@ -45,6 +49,8 @@ def test_the_adapter_equals_sb3s_own_vector_of_scalars():
                 truncated += mine["TimeLimit.truncated"]
                 failed += not mine["TimeLimit.truncated"]
     assert min(failed, truncated) > 0, "both kinds of end must have happened"
+    assert all(mine == its for mine, its in sums)
+    assert len(set(sums)) > 2
 
 
 def test_evaluation_sees_the_environment_s_own_returns():
@@ -108,7 +114,7 @@ def test_methods_and_attributes_reach_the_slots_that_are_named_as_in_sb3s_own_ve
     both(lambda env: env.reset())
     both(lambda env: env.step(action)[:3])
     ((seen, info),) = both(lambda env: env.env_method("reset", seed=8, indices=[1]))
-    assert (seen.shape, set(info)) == ((72,), {"r_c", "r_ref"})
+    assert (seen.shape, set(info)) == ((73,), {"r_c", "r_ref", "cost"})
     both(lambda env: env.env_method("reset", options={"scenario": "nominal"}, indices=2))
     assert len(both(lambda env: env.env_method("reset"))) == N
     saved = ours.env_method("get_state", indices=[0])
@@ -205,7 +211,7 @@ def test_an_estimate_is_fitted_to_the_state_and_not_to_the_reward():
     model.learn(960, LearnState())
     assert estimator.loss(seen).item() < 0.75 * start
     with torch.no_grad():  # an estimator that is right, in the units of its features
-        state = seen[:, estimator.gains.numel() :][:, [0, 1, 2, 3, 4, 13, 14, 15, 16]] * estimator.state_gains
+        state = seen[:, estimator.gains.numel() :][:, [0, 1, 2, 3, 4, 14, 15, 16, 17]] * estimator.state_gains
         estimator.estimate.forward = lambda _: state
         assert estimator.loss(seen).item() == 0.0
-        torch.testing.assert_close(estimator(seen)[:, 12:], state)
+        torch.testing.assert_close(estimator(seen)[:, 13:], state)

@@ -13,7 +13,7 @@ from cz_gym.evaluation.protocol import find_row
 FROZEN = {
     "nominal": "470ebb0cf8fc46d8", "paper-ramp": "00726411751b722d", "reference-a": "c61db8d3195dde7b",
     "reference-b": "fafc6c06ed88de8b", "randomized": "28ec8d2bf14b3b7b", "hard": "f3b0f280a51eb76d",
-    "sensor-fault": "a2ba81372aa15e66", "puller": "2104861fe7b255c8", "hot-zone": "21ba3a8c3fadda41",
+    "sensor-fault": "a2ba81372aa15e66", "puller": "2104861fe7b255c8", "hot-zone": "557eb17e2c25ee09",
     "only-recipe": "986d178b78f3b36e", "only-drift": "35df8d2d49bfbfbe", "only-interface": "8b4a530df4f47e75",
     "only-sensor": "bb58fef8179b8f19", "only-reference": "7e3a5668784daa66", "only-parameters": "6702460317bfa4ff",
 }  # fmt: skip

@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
+from cz_gym.body.cost import Cost, reward
 from cz_gym.body.signals import Logged
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import Metrics, metrics
@@ -122,25 +125,28 @@ def test_ground_off_a_taper():
     assert found.ground_off_pct == pytest.approx(expected, rel=1e-4)
 
 
-def test_return_is_the_sum_of_rewards_and_nothing_else_reads_them():
+def test_return_charges_a_lost_crystal_for_what_is_left_and_nothing_else_reads_rewards():
     run = made_up(10, lived=4, r_c=R + 1e-4)
     run.reward[:] = np.arange(10.0)[:, None]
-    rewarded = of(run)
-    assert rewarded.return_ == 45
-    assert rewarded._replace(return_=0.0) == of(made_up(10, lived=4, r_c=R + 1e-4))
+    rewarded, still = of(run), of(made_up(10, lived=4, r_c=R + 1e-4))
+    assert (rewarded.return_, still.return_) == (0 + 1 + 2 + 3 - 9 * 6, -9 * 6)
+    assert rewarded._replace(return_=0.0) == still._replace(return_=0.0)
+
+
+@given(st.floats(0.0, 1e12), st.integers(2, 5000))
+def test_to_be_lost_at_once_earns_less_than_any_life(cost, steps):
+    lost, lived = made_up(steps, lived=1), made_up(steps)
+    lost.reward[0] = reward(Cost(0.0, 0.0, 0.0, 0.0), False)
+    lived.reward[:] = reward(Cost(cost, 0.0, 0.0, 0.0), True)
+    assert of(lost).return_ < of(lived).return_
 
 
 def test_cost_is_that_of_the_reward_before_it_saturates():
-    """Each term where it is one weight, by the printed scales: 0.5 mm, 0.36 and 0.06 mm/min, 1 kW.
-
-    After a failure the radius counts to the end; drives count while the crystal lived.
-    """
-    assert of(made_up(100, r_c=R + 1e-3)).cost == pytest.approx(4.0)
-    pull = 0.5 * (0.12 / 0.36) ** 2
-    assert of(made_up(100, v_p=V + 0.36 * MM_PER_MIN)).cost == pytest.approx(pull + 0.05 * 36.0 / 100)
-    assert of(made_up(100, Q_H=Q + 1e3 * (np.arange(100) % 2))).cost == pytest.approx(0.5 * 99 / 100)
-    found = of(made_up(10, lived=4, v_p=V + 0.36 * MM_PER_MIN))
-    assert found.cost == pytest.approx((7 * 16.0**2 + 4 * pull + 0.05 * 36.0) / 10)
+    """The sum of the logged terms; from a failure on, the radius error of 8 mm alone."""
+    terms = {f"term_{name}": np.linspace(0.0, size, 10) for size, name in enumerate(Cost._fields, 1)}
+    assert of(made_up(10, **terms)).cost == pytest.approx(0.5 * 10)
+    lived = sum(each[:3].sum() for each in terms.values())
+    assert of(made_up(10, lived=4, **terms)).cost == pytest.approx((7 * 16.0**2 + lived) / 10)
 
 
 def test_cost_gives_the_reward_of_every_step():

@@ -114,6 +114,7 @@ def test_start_is_the_state_before_the_first_step_and_progress_counts_every_step
 OF_ONE = SimpleNamespace(predict=lambda observation, **rest: (np.zeros(2, np.float32), None))
 WITHOUT_STATE = SimpleNamespace(predict=lambda observation: (np.zeros((len(observation), 2), np.float32), None))
 WITHOUT_TUPLE = SimpleNamespace(predict=lambda observation, **rest: np.zeros((len(observation), 2), np.float32))
+RATE = SimpleNamespace(predict=OF_ONE.predict, made_for=make_config(action="rate", observation="measured").made_for)
 
 
 @pytest.mark.parametrize(
@@ -130,7 +131,7 @@ WITHOUT_TUPLE = SimpleNamespace(predict=lambda observation, **rest: np.zeros((le
             make_config(action="smooth", observation="measured"),
             r"made for action='direct'.* has action",
         ),
-        (load("gradient"), SHORT, r"made for action='rate'.* has action='direct'"),
+        (RATE, SHORT, r"made for action='rate'.* has action='direct'"),
         ("paper", SHORT, r"as make_controller\('paper', config\) makes one"),
     ],
 )

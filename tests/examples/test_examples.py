@@ -5,10 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from cz_gym import agents
-from examples import gradient, sb3_ppo
+from cz_gym import CzVectorEnv, agents
+from cz_gym.sb3 import CzVecEnv
+from examples import gradient, ppo_lagrangian, sb3_ppo
 
 
 @pytest.mark.usefixtures("few_crystals")
@@ -24,6 +26,23 @@ def test_the_gradient_example_writes_an_agent(tmp_path):
     assert (contract.action, contract.observation, contract.training_steps) == ("rate", "measured", 1440)
     assert "0.175 hot-zone" in contract.scenario
     assert agents.load(tmp_path / "some.onnx").contract == contract
+
+
+@pytest.mark.usefixtures("few_crystals")
+def test_the_price_of_steps_out_of_tolerance_rises_above_the_limit_and_the_reward_pays_it(tmp_path, monkeypatch):
+    """Random actions are out of tolerance most of the time, and no crystal is always."""
+    monkeypatch.setattr(ppo_lagrangian, "LIMIT", 0.0)
+    contract, multiplier = ppo_lagrangian.main(steps=8 * 4 * 64 * 3, num_envs=8, out=tmp_path / "some.onnx")
+    assert (contract.algorithm, contract.training_steps) == ("ppo-lagrangian", 6144)
+    assert 0.0 < multiplier <= 3 * ppo_lagrangian.RATE
+
+    priced = ppo_lagrangian.Priced(CzVecEnv(CzVectorEnv(2, "nominal", autoreset_mode="SameStep")))
+    priced.reset()
+    priced.multiplier = 7.0
+    faster = np.float32([[0.2, 0.0], [0.0, 0.0]])
+    charged = [priced.step(faster)[1] for _ in range(90)]
+    assert priced.crystals.cost.tolist() == [1.0, 0.0]
+    assert charged[-1][0] < charged[-1][1] - 7.0
 
 
 def test_an_example_without_its_packages_says_in_one_line_what_to_install():

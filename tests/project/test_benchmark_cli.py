@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cz_gym import agents
 from cz_gym.agents import shipped_names
 from cz_gym.agents.agent_file.contract import write_agent
 from cz_gym.baselines.registry import CONTROLLERS
@@ -83,7 +84,7 @@ def test_default_contenders_are_those_of_the_registry_and_the_shipped_agents():
     usual = [each.name for each in CONTROLLERS if each.default] + shipped_names()
     assert [each.name for each in contenders()] == usual
     (gradient,) = contenders("--controllers", "gradient")
-    assert len(gradient.trained) == 10
+    assert len(gradient.trained) == len(agents.shipped_seeds("gradient"))
 
 
 def test_the_folder_holds_every_file_and_nothing_else(finished):

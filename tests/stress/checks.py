@@ -117,17 +117,28 @@ class Watch:
             + p["C_2"] * (new["T_2"] - old["T_2"])
             + p["C_b"] * melt * (new["T_b"] - old["T_b"])
         )
-        dT_i = self._slots["dT_i"]
-        flows = 0.5 * (_losses(p, old, dT_i) + _losses(p, new, dT_i))
-        gained = self._dt * (infos["Q_H"] - flows + self._slots["Q_d"])
+        flows = 0.5 * (_losses(p, old) + _losses(p, new))
+        behind = self._slots["episode"]["heater_lag"] * (self._slots["Q_heats"] - self._old["Q_heats"])
+        gained = self._dt * (infos["Q_H"] - flows + self._slots["Q_d"]) - behind
+        gained -= _into_crystal(p, old, new, infos, self._dt)
         missing = np.where(living, np.abs(stored - gained) / (self._dt * p["Q_H_0"]), 0.0)
         self._need(missing <= BALANCE, "heat appears or disappears")
         self.missing_heat = max(self.missing_heat, float(missing.max()))
 
 
-def _losses(p, x, dT_i):
-    """Heat that insulation and melt surface lose and that the crystal takes [W]."""
-    crystal = np.pi * x["r_c"] ** 2
-    Phi_l = p["k_l"] * (x["T_b"] + dT_i - p["T_m"]) * (p["lam"] / x["h_c"] + (1.0 - p["lam"]) / p["h_0"])
-    surface = p["emission"] * (p["R_cr"] ** 2 - x["r_c"] ** 2) * (fourth_power(x["T_b"]) - fourth_power(p["T_e"]))
-    return p["G_1a"] * (x["T_1"] - p["T_a"]) + surface + crystal * Phi_l
+def _losses(p, x):
+    """Heat that insulation and melt surface lose [W]."""
+    surface = (
+        p["emission"] * np.pi * (p["R_cr"] ** 2 - x["r_c"] ** 2) * (fourth_power(x["T_b"]) - fourth_power(p["T_e"]))
+    )
+    return p["G_1a"] * (x["T_1"] - p["T_a"]) + surface
+
+
+def _into_crystal(p, old, new, infos, dt):
+    """Heat that the crystal takes from the melt in a step [J]: what it conducts away less its latent heat.
+
+    A crystal grows by what was pulled less what the meniscus rose, so nothing needs the flux within the step, which
+    fluctuates and grows without limit where a meniscus freezes.
+    """
+    grown = infos["v_p"] * dt - (new["h_c"] - old["h_c"])
+    return np.pi * 0.5 * (old["r_c"] ** 2 + new["r_c"] ** 2) * (p["Phi_s"] * dt - p["rho_dH"] * grown)

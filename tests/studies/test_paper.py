@@ -41,19 +41,16 @@ def test_the_command_writes_the_report_with_its_figures(tmp_path, numbers, monke
         assert (tmp_path / figure).read_bytes().startswith(b"\x89PNG")
         assert figure in written
     assert "nan" not in written
-    for printed in ("0.03275", "do not follow from the", "-0.22517", "0.001884", "3.368e-07", "chain does not depend"):
+    for printed in ("0.03275", "do not follow from the", "-0.22517", "0.001884", "3.368e-07"):
         assert printed in written
 
 
-def test_without_the_compensator_the_ramp_loses_the_crystal_or_cycles():
-    """Model II is lost; Model I cycles between the pull limits, nearer to its radius than the printed controller."""
-    bare = {m: ramp(m, BARE) for m in ("I", "II")}
-    assert bare["II"].failed
-    assert not bare["I"].failed
-    cycle, printed = (ramp_numbers(run) for run in (bare["I"], ramp("I")))
-    assert cycle["at_limit"] > 0.3 > 0.001 > printed["at_limit"]
-    assert cycle["late_swing_mm"] < 2.0
-    assert cycle["rmse_mm"] < 0.5 < printed["rmse_mm"]
+@pytest.mark.parametrize("model", ["I", "II"])
+def test_without_the_compensator_the_ramp_loses_the_crystal_at_the_limits_of_the_pull_speed(model):
+    bare, printed = ramp(model, BARE), ramp(model)
+    assert bare.failed
+    assert not printed.failed
+    assert ramp_numbers(bare)["at_limit"] > 0.2 > 0.001 > ramp_numbers(printed)["at_limit"]
 
 
 def test_inverse_response_against_a_double_integrator():
@@ -67,13 +64,14 @@ def test_inverse_response_against_a_double_integrator():
     assert recovery == pytest.approx(2.0 / model.zero, rel=0.01)
 
 
-def test_growth_rate_of_model_ii_does_not_depend_on_the_meniscus():
-    """Its growth rate does not depend on the meniscus; the thermal chain depends on neither model."""
-    v_g = {model: pull_change(model).signals.v_g for model in ("I", "II")}
-    assert np.ptp(v_g["II"]) < 1e-12 * v_g["II"][0]
-    assert np.ptp(v_g["I"]) > 0.01 * v_g["I"][0]
-    for name in ("T_1", "T_1_ref", "T_b"):
-        np.testing.assert_array_equal(*(getattr(ramp(m).signals, name) for m in ("I", "II")))
+def test_growth_rate_of_model_ii_follows_the_melt_and_not_the_meniscus():
+    puller = make_puller(lam=0.0)
+    one, two = (pull_change(model).signals for model in ("I", "II"))
+    slower = puller.k_l * (two.T_b - puller.T_b_0) / puller.h_0 / puller.rho_dH
+    np.testing.assert_allclose(two.v_g, puller.v_0 - slower, rtol=1e-12)
+    assert np.ptp(one.v_g) > 0.05 * puller.v_0 > 9.0 * np.ptp(two.v_g)
+    first, second = (ramp(model).signals for model in ("I", "II"))
+    np.testing.assert_allclose(first.T_b, second.T_b, rtol=0.0, atol=0.1)
 
 
 def test_compensated_measurement_is_what_the_controller_saw():

@@ -51,7 +51,8 @@ def summary(results: Sequence[Result]) -> str:
     heads, groups = overview(results)
     lines = [line for group, listed in groups.items() for line in ((f"*{group}*", *[""] * (len(heads) - 1)), *listed)]
     contract = contract_hash([result.row for result in results])
-    return f"{table(heads, lines)}\n\nContract `{contract}` (plant, random scenarios, interval, horizon)."
+    rests_on = "plant, random scenarios, interval, horizon, reward, metrics"
+    return f"{table(heads, lines)}\n\nContract `{contract}` ({rests_on})."
 
 
 def brief(results: Sequence[Result]) -> str:

@@ -25,7 +25,7 @@ def test_one_observation_and_a_batch_of_one_act_alike(agent):
     policy = OnnxPolicy.load(agent)
     seen = np.random.default_rng(0).uniform(-3.0, 3.0, (1, len(HISTORY))).astype(np.float32)
     np.testing.assert_array_equal(policy.predict(seen)[0][0], policy.predict(seen[0])[0])
-    with pytest.raises(ValueError, match="expected 72 channels"):
+    with pytest.raises(ValueError, match="expected 73 channels"):
         policy.predict(seen[:, :-1])
 
 

@@ -36,7 +36,8 @@ OMEGA = np.geomspace(1e-4, 0.5, 60)
 @pytest.mark.parametrize("lam", [1.0, 0.0])
 @pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])
 def test_loop_of_the_running_code_is_the_textbook_loop(lam, dt):
-    puller, z = make_puller(lam=lam), np.exp(1j * OMEGA * dt)
+    """The textbook's melt temperature is constant: a melt of endless heat capacity."""
+    puller, z = make_puller(lam=lam)._replace(C_b=1e18), np.exp(1j * OMEGA * dt)
     tustin = 2.0 / dt * (z - 1.0) / (z + 1.0)
     K = controller_transfer(PAPER.pid)(tustin)
     plant, s = radius_model(puller), control.tf("s")
@@ -100,11 +101,12 @@ def with_heat(controller, factor):
 def test_margins_at_the_heater_are_the_factors_on_its_power_that_the_loop_survives(name):
     form, puller = linear_form(make_controller(name, make_config("randomized", **PLAIN))), make_puller(lam=0.5)
     margins = loop_margins(form.controller, puller, 5.0, "Q_H")
-    assert close(with_heat(form.controller, 1.02 * margins.gain_down), puller, 5.0).stable
-    assert not close(with_heat(form.controller, 0.98 * margins.gain_down), puller, 5.0).stable
-    if not math.isnan(margins.gain_up):
-        assert close(with_heat(form.controller, 0.98 * margins.gain_up), puller, 5.0).stable
-        assert not close(with_heat(form.controller, 1.02 * margins.gain_up), puller, 5.0).stable
+    for gain, inward, extreme in ((margins.gain_down, 1.02, 0.001), (margins.gain_up, 0.98, 50.0)):
+        if math.isnan(gain):
+            assert close(with_heat(form.controller, extreme), puller, 5.0).stable
+        else:
+            assert close(with_heat(form.controller, inward * gain), puller, 5.0).stable
+            assert not close(with_heat(form.controller, gain / inward), puller, 5.0).stable
 
 
 def test_the_linear_form_of_an_lqg_has_the_noise_of_the_camera_that_it_is_given():
@@ -120,7 +122,7 @@ def test_a_range_of_hot_zones_ends_where_the_loop_turns_unstable():
     for factor, stable in ((0.99 * low, False), (1.01 * low, True), (0.99 * high, True), (1.01 * high, False)):
         puller = make_puller(Parameters(C_2=factor * Parameters().C_2), 0.5)
         assert close(form.controller, puller, 5.0).stable == stable
-    assert high < 1.3
+    assert high < 1.4
 
 
 @pytest.mark.parametrize("name", ["lqg", *FAMILY])

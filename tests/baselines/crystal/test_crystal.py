@@ -19,9 +19,14 @@ CROWN = Row("crown", "randomized", "a crown", process=CRYSTAL, stage="crown")
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "least", "most", "error"),
-    [("ring-pid", 0, 0, 8.0), ("ring-pid-reduced", 9, 12, 8.0), ("compensated", 10, 12, 6.0), ("lqg-along", 11, 12, 5.0),
-     ("true-radius", 12, 12, 1.0)],
-)  # fmt: skip
+    [
+        ("ring-pid", 0, 0, 8.0),
+        ("ring-pid-reduced", 9, 12, 8.0),
+        ("compensated", 10, 12, 6.0),
+        ("lqg-along", 11, 12, 5.0),
+        ("true-radius", 12, 12, 1.0),
+    ],
+)
 def test_twelve_crowns(name, least, most, error):
     """The ring freezes a PID with the body's gains; who knows the meniscus grows nearly all."""
     (contender,) = (each for each in CRYSTAL_CONTROLLERS if each.name == name)

@@ -67,7 +67,7 @@ def test_every_filter_of_the_adaptive_lqg_holds_the_slowest_hot_zones():
     pullers = pullers_of(make_config("hot-zone", **PLAIN), (1_000_102, 1_000_275))
     plain = make_controller("lqg-at-0.02", make_config("hot-zone", **PLAIN))
     hypotheses = adaptive(plain).hypotheses
-    strongest = 1.4 * plain.design.noise.slow_sd
+    strongest = 2.0 * plain.design.noise.slow_sd
     for fast, slow in product(hypotheses.fast_sd, (*hypotheses.slow_sd, strongest)):
         noise = replace(plain.design.noise, fast_sd=fast, slow_sd=slow)
         form = linear_form(replace(plain, design=replace(plain.design, noise=noise)))

@@ -9,13 +9,16 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from cz_gym import make_puller
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign, solve
 from cz_gym.baselines.lqg.model import PLANT, STATES, NoiseModel
+from cz_gym.baselines.lqg.regulator import PULL_SCALE
 from cz_gym.baselines.lqg.ring_model import RingModel
-from cz_gym.body.cost import cost_terms
+from cz_gym.body.cost import coefficients
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 from tests.observed import measured
 
 PULLER = make_puller(lam=0.5)
 LINEAR = LQGDesign(nonlinear=False, gate=np.inf, noise=NoiseModel(camera_memory=np.inf, recipe_share=0.0))
+PER_SQUARE = np.array(coefficients(LINEAR.weights)._replace(pull=LINEAR.weights.pull / PULL_SCALE**2))
+"""Its cost of a unit square of radius error, pull speed and both steps; without bands."""
 KNOWN = RingModel(5.0, 0.1 * MM, 10.0 * MINUTE, rotation=(10.0 / MINUTE, 10.0 / MINUTE))
 SCALES = np.array([MM, MM, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0 / HOUR, KILO])
 """Units in which the plant's states are of one order: in SI the covariance equation is ill-conditioned."""
@@ -79,7 +82,7 @@ def stationary_cost(gains):
     A, B = A / scales[:, None] * scales, B / scales[:, None]
     P = solve_discrete_lyapunov(A, B @ B.T, method="direct") * np.outer(scales, scales)
     by_state, by_noise = np.split(signals, [len(A)], axis=1)
-    return np.array(cost_terms(*np.sqrt(np.diag(by_state @ P @ by_state.T + by_noise @ by_noise.T))))
+    return PER_SQUARE * np.diag(by_state @ P @ by_state.T + by_noise @ by_noise.T)
 
 
 @pytest.mark.parametrize(("ring", "dt"), [(None, 5.0), (KNOWN, 5.0), (RingModel(5.0), 10.0)])
@@ -98,7 +101,7 @@ def test_cost_through_predict_matches_the_covariance_equation(ring, dt):
         y = x @ H.T + glitches * (k == settle)
         action, state = controller.predict(measured(ring_error=y[:, 0], T_1=y[:, 1], v_p=u[:, 0], Q_H=u[:, 1]), state)
         moved = action.astype(float) * [PULLER.v_0, 1e4]
-        cost.append([np.sum(term) for term in cost_terms(x[:, 0], moved[:, 0], *(moved - u).T)])
+        cost.append(PER_SQUARE * np.sum(np.square([x[:, 0], moved[:, 0], *(moved - u).T]), axis=1))
         x, u = x @ A.T + moved @ B.T + kicks * (k == settle), moved
     terms = np.sum(cost, axis=0)
     np.testing.assert_allclose(terms, stationary_cost(gains), rtol=1e-2)

@@ -118,7 +118,7 @@ def test_the_plan_is_the_recipe_five_minutes_ahead(dt):
     plan = np.zeros((1, 2, samples + 1))
     for k in range(round(900.0 / dt)):
         shown = [np.array([recipe(k * dt + ahead)]) for ahead in (0.0, 60.0, 300.0)]
-        seen = Measured(zeros, zeros, *shown, *(2.0 * value for value in shown), zeros, zeros, zeros)
+        seen = Measured(zeros, zeros, *shown, *(2.0 * value for value in shown), *[zeros] * 4)
         plan = look_ahead(plan, seen, np.array([k == 0]), dt)
         if k * dt >= 300.0:
             future = recipe((k + np.arange(samples + 1)) * dt)

@@ -100,7 +100,7 @@ def test_what_was_found_is_used_for_that_puller_alone(tmp_path):
 def test_one_command_designs_and_another_runs_it(tmp_path, monkeypatch, capsys):
     place = tmp_path / "mine.toml"
     write_puller(find_puller("silicon-300mm"), place)
-    figures = Figures(0.1, 0.01, 0.01, 1900.0, 0.0, 5400)
+    figures = Figures(0.1, 0.01, 0.01, 0.1, 1900.0, 0.0, 5400)
     monkeypatch.setattr(tune, "measure", lambda policy, config, seeds: figures)
     monkeypatch.setattr(tune, "in_processes", lambda function, tasks, look: enumerate(map(function, tasks)))
     assert tune.main(["--puller", str(place), "--trials", "10"]) == 0

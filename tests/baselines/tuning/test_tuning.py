@@ -20,7 +20,7 @@ from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.machine.puller import FOLDER
 from tests.observed import PLAIN
 
-FIGURES = Figures(0.06, 0.01, 0.02, 1900.0, 0.0, 2160)
+FIGURES = Figures(0.06, 0.01, 0.02, 0.1, 1900.0, 0.0, 2160)
 CONFIG = make_config("randomized", **PLAIN)
 TWO = Parameter("T_f", 1.0, 100.0), Parameter("K_ff", -1.0, 1.0, log=False)
 

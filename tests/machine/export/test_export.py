@@ -25,7 +25,7 @@ from cz_gym.machine.export.ports import INPUTS, Alarm, in_shares
 from cz_gym.machine.export.text import write_c, write_st
 from cz_gym.machine.export.vector import test_vector as vector_of
 from cz_gym.machine.identify.log import record_log
-from cz_gym.observation import decode, readable
+from cz_gym.observation import DRIVE_CHANNELS, decode, readable
 from cz_gym.vector import CzVectorEnv
 from studies.export import LARGEST, report, study
 from studies.faults import FAULTS, grow
@@ -159,7 +159,7 @@ def test_an_exported_agent_acts_as_onnxruntime_does(name):
         inputs = twin.inputs(np.asarray(measured, np.float64), np.full(n, k))
         outputs, memory = block.run(inputs | {"takeover_s": 0.0}, memory)
         if k:
-            applied, gains = measured[:, -2:].astype(np.float64), np.array([drives.pull, drives.heater])
+            applied, gains = measured[:, DRIVE_CHANNELS].astype(np.float64), np.array([drives.pull, drives.heater])
             wanted = np.clip(drives.keep * applied + gains * np.asarray(action), -1.0, 1.0)
             assert (twin.action_of(outputs) - wanted) / gains == pytest.approx(0.0, abs=1e-4)
         seen, measured = own.step(np.asarray(action))[0], env.step(np.asarray(action))[0]

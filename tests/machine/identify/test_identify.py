@@ -19,13 +19,14 @@ from cz_gym.machine.identify.model import LAM, Lags, Model, Noise, heating, pred
 from cz_gym.machine.identify.moves import measure_excitation
 from cz_gym.machine.identify.verdict import coloured
 from cz_gym.machine.puller import DEFAULT
-from cz_gym.observation import decode
+from cz_gym.observation import MEASURED, decode
 from tests.foreign_puller import ForeignPuller, Operator, drive, write_log
 from tests.machine.identify.conftest import TRUTH
 
 
-@pytest.mark.parametrize(("interval", "off"), [(5.0, 1e-5), (10.0, 1e-4)])
+@pytest.mark.parametrize(("interval", "off"), [(5.0, 3e-4), (10.0, 3e-4)])
 def test_without_noise_the_filter_of_the_true_puller_predicts_every_reading(interval, off, tmp_path):
+    """The filter's first guess parts the ring's offset between camera and radius, by 0.3 mm, which the melt feels."""
     env = CzEnv("nominal", 0.5, "measured", interval, 3600.0, parameters=TRUTH, action="direct", info="all")
     record_log(env, Excited(OpenLoop(), heater=0.01), tmp_path / "log.csv", seed=0)
     log, model = read_log(tmp_path / "log.csv"), Model(("C_1",), TRUTH)
@@ -167,7 +168,7 @@ def test_the_drives_follow_the_sequence_whatever_the_action_means(action):
 
 def test_excitation_stops_for_good_beyond_a_radius_error():
     excited = Excited(OpenLoop(), limit=1.5e-3)
-    near, far = np.zeros((2, 1, 11), np.float32)
+    near, far = np.zeros((2, 1, len(MEASURED)), np.float32)
     near[:, 1] = far[:, 1] = 1.0
     far[:, 0] = 1.6
     action, state = excited.predict(near)
