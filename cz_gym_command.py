@@ -14,6 +14,7 @@ COMMANDS = {
     "tune": ("cz_gym.commands.tune", "search settings of controllers, or design them for a puller"),
     "identify": ("cz_gym.machine.identify.__main__", "estimate a puller's numbers from its log"),
     "puller": ("cz_gym.machine.describe", "write and check puller files"),
+    "recipe": ("cz_gym.commands.recipe", "set points of a whole crystal against its length"),
     "export": ("cz_gym.machine.export.__main__", "write a controller or agent as code for a PLC"),
     "serve": ("cz_gym.machine.serve.__main__", "run a virtual puller on OPC UA"),
     "play": ("cz_gym.play", "pull a crystal by hand"),

@@ -10,12 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.action import MadeFor, mark
+from cz_gym.body.process import BODY
 from cz_gym.config import Config, positive
 from cz_gym.errors import CzError
 from cz_gym.machine.puller import DEFAULT, PullerFile
 from cz_gym.observation import Measured, decode, readable
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
+from cz_gym.process import Process
 from cz_gym.support.nested import select
 
 Floats = npt.NDArray[np.float64]
@@ -56,6 +58,8 @@ class MeasuredController(ABC):
     are refused by other environments than the one it was made for.
     """
 
+    process: ClassVar[Process] = BODY
+    """What it controls."""
     observation: ClassVar[str] = "measured"
     """Observation that it reads."""
     action: ClassVar[str] = "direct"
@@ -93,14 +97,16 @@ class MeasuredController(ABC):
         if self.any_environment:
             return None
         plant: dict[str, Any] = {"parameters": self.parameters, "meniscus": self.meniscus, "puller": self.puller}
-        return Config(action=self.action, control_interval=self.control_interval, **plant).made_for
+        return Config(
+            action=self.action, control_interval=self.control_interval, process=self.process, **plant
+        ).made_for
 
     @property
     def settings(self) -> dict[str, Any]:
         """Arguments of ``gym.make("Cz-v0", ...)`` for the environment that it was made for."""
         given = {"observation": self.observation, "action": self.action, "control_interval": self.control_interval}
         plant: dict[str, Any] = {"meniscus": (self.meniscus, HURLE), "puller": (self.puller, DEFAULT)}
-        if self.puller == DEFAULT:
+        if self.puller == DEFAULT and self.process is BODY:
             plant["parameters"] = self.parameters, Parameters()
         return given | {name: own for name, (own, default) in plant.items() if own != default}
 
@@ -117,14 +123,19 @@ class MeasuredController(ABC):
     def step(self, seen: Measured, memory: Any) -> tuple[Floats, Floats, Any]:
         """Pull speed v_p - v_0 [m/s] and heater power Q_H - Q_H0 [W], each of shape (n,), and the new memory."""
 
+    def read(self, array: Floats) -> Measured:
+        """The channels of observations, shape (n, channels), in SI units."""
+        seen: Measured = decode(array, self.v_0, self.heater_range, self.process)
+        return seen
+
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[npt.NDArray[np.float32], Any]:
         """Return the action and the next memory; arguments as of :class:`Policy`."""
         array, single = batched(observation)
-        seen = decode(array, self.v_0, self.heater_range)
+        seen = self.read(array)
         if state is None or (episode_start is not None and np.any(episode_start)):
-            first = Measured(*(np.where(np.isfinite(channel), channel, 0.0) for channel in seen))
+            first = type(seen)(*(np.where(np.isfinite(channel), channel, 0.0) for channel in seen))
             state = fresh(state, State(first, self.at_rest(first)), episode_start)
         good = np.isfinite(array).all() and (seen.valid > 0.5).all()
         read = seen if good else readable(seen, state.readings)

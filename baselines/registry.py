@@ -5,14 +5,18 @@ from functools import partial
 
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.bounds.lqg import full_information, privileged
+from cz_gym.baselines.crystal.tuned import COMPENSATED_PID, LQG_ALONG, REDUCED_PID, RING_PID, TRUE_PID
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.mpc import ekf_mpc
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.tuning.lqg import BEST_RETURN, FILTER, LQGS, TunedLQG, adaptive
 from cz_gym.baselines.tuning.pid import PIDS, paper_here
+from cz_gym.body.process import BODY
 from cz_gym.config import Config, check_config
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.errors import CzError
 from cz_gym.evaluation.contender import Contender, unchanged
+from cz_gym.process import Process
 from cz_gym.support.names import unknown
 
 from .policy import OpenLoop, Policy
@@ -93,18 +97,33 @@ CONTROLLERS: tuple[Contender, ...] = (
         slow=True,
     ),
 )
-"""Every named controller, in the order of tables."""
+"""Every named controller of ``Cz-v0``, in the order of tables."""
+CRYSTAL_CONTROLLERS: tuple[Contender, ...] = (
+    _measured("recipe", partial(unchanged, OpenLoop()), meaning="the recipe's pull speed and power, no feedback"),
+    _measured("ring-pid", RING_PID.for_config, meaning="PID on the bright ring with the body's gains"),
+    _measured("ring-pid-reduced", REDUCED_PID.for_config, meaning="the same with smaller gains in crown and tail"),
+    _measured(
+        "compensated",
+        COMPENSATED_PID.for_config,
+        meaning="PID on the ring less the height that the paper's compensator predicts along the recipe",
+        quoted=True,
+    ),
+    _measured("lqg-along", LQG_ALONG.for_config, meaning="Kalman filter and regulator designed along the recipe"),
+    _bound("true-radius", TRUE_PID.for_config, "state", "bound: the PID on the true radius, which no sensor shows"),
+)
+"""Every named controller of ``CzCrystal-v0``, tuned by hand."""
 
 
-def find_controller(name: str) -> Contender:
-    """The controller of that name; CzError lists the known ones for another."""
-    for entry in CONTROLLERS:
+def find_controller(name: str, process: Process = BODY) -> Contender:
+    """The controller of that name for a process; CzError lists the known ones for another name."""
+    known = CRYSTAL_CONTROLLERS if process is CRYSTAL else CONTROLLERS
+    for entry in known:
         if entry.name == name:
             return entry
-    raise CzError(unknown("controller", name, [entry.name for entry in CONTROLLERS]))
+    raise CzError(unknown("controller", name, [entry.name for entry in known]))
 
 
 def make_controller(name: str, config: Config) -> Policy:
     """The controller of that name for an environment; CzError lists the known ones for another name."""
-    controller: Policy = find_controller(name).make(check_config(config))
+    controller: Policy = find_controller(name, check_config(config).process).make(config)
     return controller

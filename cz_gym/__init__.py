@@ -1,6 +1,6 @@
 """Cz-v0: Czochralski crystal growth as a Gymnasium environment.
 
-Importing this package registers ``Cz-v0``; ``gym.make("cz_gym:Cz-v0")`` imports it by itself.
+Importing this package registers ``Cz-v0`` and ``CzCrystal-v0``; ``gym.make("cz_gym:Cz-v0")`` imports it by itself.
 """
 
 import sys
@@ -47,6 +47,11 @@ __all__ = [
 ]
 
 gym.register(id=ENV_ID, entry_point="cz_gym.env:CzEnv", vector_entry_point="cz_gym.vector:CzVectorEnv")
+gym.register(
+    id="CzCrystal-v0",
+    entry_point="cz_gym.crystal.env:CzCrystalEnv",
+    vector_entry_point="cz_gym.crystal.env:CzCrystalVectorEnv",
+)
 
 
 def __getattr__(name: str) -> Any:

@@ -124,7 +124,9 @@ class Config:
 
         Not of its code: an equation that is written otherwise, and says the same, is the same plant.
         """
-        parameters = type(self.parameters)(*(float(value) + 0.0 for value in self.parameters))
+        given, apart = self.parameters._asdict(), self.process.apart
+        numbers = (0.0 if name in apart else float(value) + 0.0 for name, value in given.items())
+        parameters = type(self.parameters)(*numbers)
         return _hash(VERSION, *parameters, *_computed(self.process, self.meniscus, parameters))
 
     @property
@@ -150,7 +152,8 @@ class Config:
     @property
     def identity(self) -> Identity:
         """The settings that a saved state depends on."""
-        scenario = f"{self.scenario.name!r} ({self.scenario.hash})"
+        grown = "".join(f", {name} {getattr(self.parameters, name):g}" for name in self.process.apart)
+        scenario = f"{self.scenario.name!r} ({self.scenario.hash}){grown}"
         low, high = self.mix
         mix = float(low) + 0.0, float(high) + 0.0
         seen = f"camera {tuple(self.camera)}" if self.observation == CAMERA else self.observation
@@ -179,7 +182,7 @@ def make_config(
     model: str | float | None = None,
     observation: str = "history",
     control_interval: float | None = None,
-    horizon: float = 10800.0,
+    horizon: float | None = None,
     parameters: Parameters | None = None,
     meniscus: MeniscusModel | None = None,
     camera: Camera | None = None,
@@ -187,6 +190,7 @@ def make_config(
     puller: str | Path | PullerFile | None = None,
     process: Process | None = None,
     weights: Mapping[str, float] | None = None,
+    stage: Any = None,
 ) -> Config:
     """Check the arguments of the environment; CzError names what was given and what is allowed."""
     machine, process = find_puller(puller), process or BODY
@@ -201,16 +205,19 @@ def make_config(
     if camera is not None and observation != CAMERA:
         raise CzError(f'a camera is of use with observation="camera" only, not with {observation!r}')
     interval = positive("control_interval", machine.control_interval if control_interval is None else control_interval)
-    length = positive("horizon", horizon)
+    shape = meniscus or HURLE
+    if not isinstance(shape, MeniscusModel):
+        raise CzError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
+    given = machine.parameters if parameters is None else parameters
+    checked = process.check(process.complete(given, machine, stage), shape)
+    usual = interval * math.ceil(process.duration(checked, shape) / interval)
+    length = positive("horizon", usual if horizon is None else horizon)
     steps = length / interval
     if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
         raise CzError(f"horizon {horizon} s must be a whole number of control intervals of {interval:g} s")
-    if meniscus is not None and not isinstance(meniscus, MeniscusModel):
-        raise CzError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
-    checked = process.check(machine.parameters if parameters is None else parameters, meniscus or HURLE)
     checked_camera = check_camera(camera_for(checked) if camera is None else camera, checked)
     return Config(
-        *(drawn_from, model, observation, action, interval, length, checked, meniscus or HURLE, checked_camera),
+        *(drawn_from, model, observation, action, interval, length, checked, shape, checked_camera),
         puller=machine,
         process=process,
         weights=process.weights if weights is None else _weights(weights, process.weights),

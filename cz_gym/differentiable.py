@@ -59,6 +59,9 @@ class DifferentiableBatch:
     ``config`` is the environment's (:func:`cz_gym.config.make_config`). Its control interval may be up to the
     5 s for which disturbances are held, and its camera's latency must not be longer than the control interval.
 
+    On ``CzCrystal-v0`` derivatives of state and cost are whole; ``measured_by_state`` leaves out how references change
+    with the length.
+
     Noise, freezes and drop-outs are those of the environment; a held reading depends on the state at which it was
     taken. The derivatives ignore that the heater moves in whole steps and that observations are rounded; where a
     scenario has a heater's lag or a pyrometer's filter, they are those of a machine without either.

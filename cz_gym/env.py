@@ -168,7 +168,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         model: str | float | None = None,
         observation: str = "history",
         control_interval: float | None = None,
-        horizon: float = 10800.0,
+        horizon: float | None = None,
         render_mode: str | None = None,
         parameters: Parameters | None = None,
         meniscus: MeniscusModel | None = None,
@@ -179,9 +179,10 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         puller: str | Path | PullerFile | None = None,
         process: Process | None = None,
         weights: Mapping[str, float] | None = None,
+        stage: Any = None,
         **others: Any,
     ) -> None:
-        known_keywords(others, type(self).__init__)
+        known_keywords(others, type(self).__init__, CzEnv.__init__)
         config = make_config(
             scenario,
             model,
@@ -195,6 +196,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
             puller,
             process,
             weights,
+            stage,
         )
         self._setup(config, render_mode, render_size, info)
 

@@ -6,13 +6,13 @@ readings by millimetres, so the differences have scales of their own.
 """
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cz_gym.body.process import BODY
 from cz_gym.body.signals import PREVIEWS as PREVIEWS
-from cz_gym.body.signals import RELATIVE
 from cz_gym.body.signals import Measured as Measured
 from cz_gym.errors import CzError
 from cz_gym.process import HEATER_SCALE as HEATER_SCALE
@@ -79,31 +79,38 @@ CAMERA = "camera"
 """The observation that is an image instead of channels (:mod:`cz_gym.camera`)."""
 
 
-def decode(observation: npt.ArrayLike, v_0: float = PULL_SCALE, heater_range: float = HEATER_SCALE) -> Measured:
-    """Read a "measured" or "history" observation, shape (..., channels), back into SI units.
+def decode(
+    observation: npt.ArrayLike,
+    v_0: float = PULL_SCALE,
+    heater_range: float = HEATER_SCALE,
+    process: Process = BODY,
+) -> Any:
+    """Read a "measured" or "history" observation, shape (..., channels), back into SI units: a ``process.Measured``.
 
     ``v_0`` [m/s] and ``heater_range`` [W] are the puller's (:attr:`cz_gym.config.Config.ranges`).
 
     Raises ValueError if the last axis is neither.
     """
     array = np.asarray(observation, dtype=np.float64)
-    if array.ndim == 0 or array.shape[-1] not in (len(MEASURED), len(HISTORY)):
+    measured, history = (observations(process)[name] for name in ("measured", "history"))
+    if array.ndim == 0 or array.shape[-1] not in (len(measured), len(history)):
         raise CzError(
-            f"expected an observation of {len(MEASURED)} (measured) or {len(HISTORY)} (history) channels, "
+            f"expected an observation of {len(measured)} (measured) or {len(history)} (history) channels, "
             f"got shape {array.shape}"
         )
-    present = (HISTORY if array.shape[-1] == len(HISTORY) else MEASURED)[: len(MEASURED)]
-    values = Measured(*np.moveaxis(array[..., : len(MEASURED)] * scales(present, v_0, heater_range), -1, 0))
-    if array.shape[-1] == len(MEASURED):
+    present = (history if array.shape[-1] == len(history) else measured)[: len(measured)]
+    values = process.Measured(*np.moveaxis(array[..., : len(measured)] * scales(present, v_0, heater_range), -1, 0))
+    if array.shape[-1] == len(measured):
         return values
-    return values._replace(**{each.name: getattr(values, each.name) + getattr(values, each.to) for each in RELATIVE})
+    sums = {each.name: getattr(values, each.name) + getattr(values, each.to) for each in process.relative}
+    return values._replace(**sums)
 
 
-def readable(seen: Measured, last: Measured) -> Measured:
+def readable(seen: Any, last: Any) -> Any:
     """A sample with the ``last`` reading wherever a channel is not finite or the ring is not valid."""
-    finite = Measured(*map(np.isfinite, seen))
+    finite = type(seen)(*map(np.isfinite, seen))
     valid = (seen.valid > 0.5) & finite.ring_error
-    kept = Measured(*map(np.where, finite, seen, last))
+    kept = type(seen)(*map(np.where, finite, seen, last))
     ring_error = np.where(valid, seen.ring_error, last.ring_error + last.r_ref - kept.r_ref)
     return kept._replace(ring_error=ring_error, valid=valid.astype(np.float64))
 

@@ -32,8 +32,9 @@ from typing import Any, NamedTuple, get_type_hints
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.errors import CzError
 from cz_gym.jit.compile import jittable, static
-from cz_gym.support.units import KILO, MM_PER_MIN
+from cz_gym.support.units import HOUR, KILO, MM_PER_MIN
 
 GROWS, LOST, DONE = 0, 1, 2
 """What ``accept`` says of a substep: it goes on, it ends in failure, it ends with success."""
@@ -103,9 +104,21 @@ class NoExtra(NamedTuple):
 
 
 @jittable
-def carry_nothing(extra: Any, u: Any, p: Any, interval: Any) -> Any:
+def carry_nothing(extra: Any, u: Any, slot: Any, interval: Any) -> Any:
     """Nothing is carried on: a process without numbers besides the state."""
     return extra
+
+
+def no_stages(parameters: Any, machine: Any, stage: Any) -> Any:
+    """The parameters of a process without stages; CzError for a stage."""
+    if stage is not None:
+        raise CzError(f"only CzCrystal-v0 has stages, not this environment: stage={stage!r} must be left out")
+    return parameters
+
+
+def three_hours(parameters: Any, meniscus: Any) -> float:
+    """The usual length of an episode [s]."""
+    return 3.0 * HOUR
 
 
 @static
@@ -141,7 +154,8 @@ class Process(NamedTuple):
     begin: Function
     """``begin(slot, m)``: the first ``State``; sets ``Extra`` and the table in the slot."""
     nominal: Function
-    """``nominal(x, slot)``: the ``Inputs`` from which actions and observed drives are counted."""
+    """``nominal(x, slot, interval)``: the ``Inputs`` from which actions and observed drives are counted in the control
+    interval [s] that begins at x."""
     hidden_load: Function
     """``hidden_load(p_drift, p)``: heat load [W] that a recipe shifted by p_drift [K] would cancel."""
     disturb: Function
@@ -179,9 +193,17 @@ class Process(NamedTuple):
     Extra: Any = NoExtra
     """Numbers of a slot that outlive a step."""
     carry: Function = carry_nothing
-    """``carry(extra, u, p, interval)``: ``Extra`` after the drives have moved to u."""
+    """``carry(extra, u, slot, interval)``: ``Extra`` after the drives have moved to u; ``slot.v_p_nominal`` and
+    ``slot.Q_H_nominal`` are nominal now."""
     table: tuple[int, int] = (0, 0)
     """Rows and columns of ``slot.table``, which ``begin`` fills; none by default."""
+    complete: Function = no_stages
+    """``complete(parameters, machine, stage)``: the parameters that ``check`` takes, of a puller's, its file
+    (:class:`cz_gym.machine.puller.PullerFile`) and the stage that the user names; CzError if there is no such stage."""
+    apart: tuple[str, ...] = ()
+    """Parameters that say what an episode grows; the plant does not depend on them."""
+    duration: Function = three_hours
+    """``duration(parameters, meniscus)``: the usual length of an episode [s]."""
 
     @property
     def functions(self) -> tuple[Any, ...]:

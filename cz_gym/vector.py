@@ -49,7 +49,7 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
-        known_keywords(settings, make_config, type(self).__init__)
+        known_keywords(settings, make_config, CzVectorEnv.__init__)
         config = make_config(scenario, **settings)
         if render_mode is not None:
             raise CzError(f"a batch does not render: render_mode must be None, not {render_mode!r}")

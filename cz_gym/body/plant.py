@@ -58,6 +58,17 @@ class Growth(NamedTuple):
     """Heat flux from the melt into the interface [W/m2]."""
 
 
+class Heating(NamedTuple):
+    """What the heat flows of a puller do."""
+
+    heater: Any
+    """Rate of the heater's temperature [K/s]."""
+    crucible: Any
+    """Rate of the crucible's temperature [K/s]."""
+    melt: Any
+    """Heat that stays in the melt, without disturbance [W]."""
+
+
 class Puller(NamedTuple):
     """The constants of one puller: the parameters in the rates, and those that follow from its operating point."""
 
@@ -192,9 +203,15 @@ def make_puller(parameters: Parameters | None = None, lam: float = 1.0, meniscus
 @force_inlined
 def growth(x: Any, d: Any, p: Any, slope: Any) -> Any:
     """Growth rate from the interface's heat balance, and the cone angle from the meniscus slope."""
-    Phi_l = p.k_l * (x.T_b + d.dT_i - p.T_m) * (p.lam / x.h_c + (1.0 - p.lam) / p.h_0)
-    v_g = (p.Phi_s - Phi_l) / p.rho_dH
     sin_theta, cos_theta = slope(x.r_c, x.h_c, p)
+    return interface(x, d, p, p.Phi_s, sin_theta, cos_theta)
+
+
+@force_inlined
+def interface(x: Any, d: Any, p: Any, Phi_s: Any, sin_theta: Any, cos_theta: Any) -> Any:
+    """Growth with this heat flux into the crystal [W/m2], at this angle of the meniscus."""
+    Phi_l = p.k_l * (x.T_b + d.dT_i - p.T_m) * (p.lam / x.h_c + (1.0 - p.lam) / p.h_0)
+    v_g = (Phi_s - Phi_l) / p.rho_dH
     sin_alpha = sin_theta * p.cos_alpha_0 - cos_theta * p.sin_alpha_0
     cos_alpha = cos_theta * p.cos_alpha_0 + sin_theta * p.sin_alpha_0
     return Growth(v_g, sin_alpha / cos_alpha, Phi_l)
@@ -211,18 +228,29 @@ def fourth_power(T: Any) -> Any:
 def rates(x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
     """Time derivatives of the state [m/s, m/s, K/s, K/s, K/s]; design equations of section 2."""
     at_interface = growth(x, d, p, slope)
-    radiated = p.kappa_12 * (fourth_power(x.T_1) - fourth_power(x.T_2))
-    into_melt = p.G_2b * (x.T_2 - x.T_b)
-    covered = math.pi * x.r_c * x.r_c
-    open_surface = math.pi * p.R_cr * p.R_cr - covered
-    surface_loss = p.emission * open_surface * (fourth_power(x.T_b) - fourth_power(p.T_e))
-    into_crystal = covered * at_interface.Phi_l
+    heat = heating(x, u, p, p.G_2b, at_interface.Phi_l)
     return State(
         at_interface.v_g * at_interface.tan_alpha,
         u.v_p - at_interface.v_g,
+        heat.heater,
+        heat.crucible,
+        (heat.melt + d.Q_d) / (p.C_b * d.melt),
+    )
+
+
+@force_inlined
+def heating(x: Any, u: Any, p: Any, G_2b: Any, Phi_l: Any) -> Any:
+    """:class:`Heating` through a wall of this conductance [W/K], with this flux into the interface [W/m2]."""
+    radiated = p.kappa_12 * (fourth_power(x.T_1) - fourth_power(x.T_2))
+    into_melt = G_2b * (x.T_2 - x.T_b)
+    covered = math.pi * x.r_c * x.r_c
+    open_surface = math.pi * p.R_cr * p.R_cr - covered
+    surface_loss = p.emission * open_surface * (fourth_power(x.T_b) - fourth_power(p.T_e))
+    into_crystal = covered * Phi_l
+    return Heating(
         (u.Q_H - radiated - p.G_1a * (x.T_1 - p.T_a)) / p.C_1,
         (radiated - into_melt) / p.C_2,
-        (into_melt - surface_loss - into_crystal + d.Q_d) / (p.C_b * d.melt),
+        into_melt - surface_loss - into_crystal,
     )
 
 

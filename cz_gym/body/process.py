@@ -50,7 +50,7 @@ def begin(slot: Any, m: Any) -> Any:
 
 
 @jittable
-def nominal(x: Any, slot: Any) -> Any:
+def nominal(x: Any, slot: Any, interval: Any) -> Any:
     """The operating point's inputs."""
     return Inputs(slot.puller.v_0, slot.puller.Q_H_0)
 
@@ -126,7 +126,7 @@ def lean(slot: Any, measured: Any) -> Any:
 
 
 @jittable
-def carry(extra: Any, u: Any, p: Any, interval: Any) -> Any:
+def carry(extra: Any, u: Any, slot: Any, interval: Any) -> Any:
     """The mean pull speed after an interval."""
     return Extra(cost.moved_mean(extra.v_p_mean, u.v_p, interval))
 

@@ -12,17 +12,17 @@ _EPS, _POWER = 1e-9, 3
 
 
 @jittable
-def next_speed(v_p: Any, pull: Any, drives: Any, nominal: Any, e: Any, interval: Any) -> Any:
-    """The pull speed [m/s] after an action, within its window and slew rate."""
-    speed = drives.keep * ((v_p - nominal) / drives.speed) + drives.pull * clip(pull, 1.0)
+def next_speed(v_p: Any, pull: Any, drives: Any, nominal: Any, before: Any, e: Any, interval: Any) -> Any:
+    """The pull speed [m/s] after an action, within its window and slew rate; ``before``: nominal for the last one."""
+    speed = drives.keep * ((v_p - before) / drives.speed) + drives.pull * clip(pull, 1.0)
     wanted = nominal + clip(drives.speed * clip(speed, 1.0), e.pull_window)
     return v_p + clip(wanted - v_p, e.pull_slew * interval)
 
 
 @jittable
-def next_power(Q_H: Any, heat: Any, drives: Any, nominal: Any, e: Any, interval: Any) -> Any:
+def next_power(Q_H: Any, heat: Any, drives: Any, nominal: Any, before: Any, e: Any, interval: Any) -> Any:
     """The heater power [W] after an action, within its slew rate, before it is rounded to whole steps."""
-    share = drives.keep * ((Q_H - nominal) / drives.power) + drives.heater * clip(heat, 1.0)
+    share = drives.keep * ((Q_H - before) / drives.power) + drives.heater * clip(heat, 1.0)
     power = nominal + drives.power * clip(share, 1.0)
     power = power if power.real > 0.0 else 0.0
     return Q_H + clip(power - Q_H, e.heater_slew * interval)
@@ -31,10 +31,10 @@ def next_power(Q_H: Any, heat: Any, drives: Any, nominal: Any, e: Any, interval:
 @jittable
 def next_inputs(x: Any, u: Any, action: Any, drives: Any, slot: Any, interval: Any, process: Any) -> Any:
     """The inputs after an action, before the heater is rounded to whole steps, from those before and the state."""
-    e, nominal = slot.episode, process.nominal(x, slot)
+    e, nominal = slot.episode, process.nominal(x, slot, interval)
     return Inputs(
-        next_speed(u.v_p, action.v_p, drives, nominal.v_p, e, interval),
-        next_power(u.Q_H, action.Q_H, drives, nominal.Q_H, e, interval),
+        next_speed(u.v_p, action.v_p, drives, nominal.v_p, slot.v_p_nominal, e, interval),
+        next_power(u.Q_H, action.Q_H, drives, nominal.Q_H, slot.Q_H_nominal, e, interval),
     )
 
 
@@ -46,11 +46,12 @@ def drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any, process: 
     slot.clipped = 1.0 if (np.abs(pull) > 1.0 or np.abs(heat) > 1.0) else 0.0
     u = next_inputs(x, Inputs(slot.v_p, slot.Q_H_slewed), Inputs(pull, heat), drives, slot, interval, process)
     slot.v_p, slot.Q_H_slewed, slot.Q_H = u.v_p, u.Q_H, u.Q_H
+    nominal = process.nominal(x, slot, interval)
+    slot.v_p_nominal, slot.Q_H_nominal = nominal.v_p, nominal.Q_H
     if e.heater_step > 0.0:
-        nominal = process.nominal(x, slot).Q_H
-        whole = nominal + e.heater_step * np.rint((slot.Q_H_slewed - nominal) / e.heater_step)
+        whole = nominal.Q_H + e.heater_step * np.rint((slot.Q_H_slewed - nominal.Q_H) / e.heater_step)
         slot.Q_H = np.maximum(whole, 0.0)
-    extra = process.carry(labelled(process.Extra, slot), labelled(Inputs, slot), slot.puller, interval)
+    extra = process.carry(labelled(process.Extra, slot), labelled(Inputs, slot), slot, interval)
     set_labelled(process.Extra, extra, slot)
 
 

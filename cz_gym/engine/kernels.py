@@ -30,13 +30,14 @@ _LINE = 8
 
 
 @jittable
-def _begin(slot: Any, model: Any) -> None:
+def _begin(slot: Any, interval: Any, model: Any) -> None:
     """Put a slot with drawn constants at the start of its episode."""
     e, process = slot.episode, model.process
     set_labelled(process.State, process.begin(slot, model.meniscus), slot.x)
-    nominal = process.nominal(slot.x, slot)
+    nominal = process.nominal(slot.x, slot, interval)
     slot.v_p, slot.Q_H, slot.Q_H_slewed = nominal.v_p, nominal.Q_H, nominal.Q_H
     slot.v_p_before, slot.Q_H_before, slot.clipped = nominal.v_p, nominal.Q_H, 0.0
+    slot.v_p_nominal, slot.Q_H_nominal = nominal.v_p, nominal.Q_H
     slot.fast, slot.slow = first_fluctuation(e, slot.streams)
     slot.dT_i, slot.Q_d, slot.drift = fluctuation(e, slot.fast, slot.slow), 0.0, np.nan
     slot.integral, slot.Q_heats = 0.0, nominal.Q_H
@@ -187,7 +188,7 @@ def build_kernels(process: Process, meniscus: MeniscusModel) -> Kernels:
             episode = draw_episode(record, slot.streams, slot.freezes)
             for number in range(len(episode)):
                 numbers[model.constants + number] = episode[number]
-            _begin(slot, model)
+            _begin(slot, clock.interval, model)
             memory.frames[i, :, 3] = slot.Q_H
             _sample_alone(memory, i, True, clock, scales, out, model)
         return impossible

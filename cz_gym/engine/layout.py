@@ -28,8 +28,9 @@ def slot_type(process: Process) -> np.dtype[Any]:
     and the index of its ``scenario`` in the mixture, the drives [m/s, W] of the step before and whether the action was
     clipped: a sample can be written again from its slot. Then the 5 s grid point that ``dT_i`` belongs to with its two
     processes [standard deviations], the episode's random streams, as far as they are drawn from, the power that heats
-    [W] where the heater is slow, the pyrometer's filter with the true temperature at the last sample [K], and what the
-    process adds: the fields of ``Extra`` and its table.
+    [W] where the heater is slow, the pyrometer's filter with the true temperature at the last sample [K], the nominal
+    drives [m/s, W] from which the last action was counted, and what the process adds: the fields of ``Extra`` and its
+    table.
     """
     number, whole, table = np.float64, np.int64, process.table
     return np.dtype(
@@ -49,6 +50,7 @@ def slot_type(process: Process) -> np.dtype[Any]:
             ("slow", number),
             ("streams", np.uint64, (len(Stream), WORDS)),
             *((name, number) for name in ("Q_heats", "T_filtered", "T_1_before")),
+            *((name, number) for name in ("v_p_nominal", "Q_H_nominal")),
             *((name, number) for name in process.Extra._fields),
             *([("table", number, table)] if table[0] else []),
         ],

@@ -153,7 +153,7 @@ def _carried_by(J: Any, slot: Any, extra: Any, interval: Any, model: Any) -> Non
     """Derivatives of what the process carries on, from those of the inputs."""
     if model.extras > 0:
         by, process = scratch(model.extras, model.carried_by), model.process
-        derivatives(process.Extra, process.carry, (extra, labelled(Inputs, slot)), (slot.puller, interval), by)
+        derivatives(process.Extra, process.carry, (extra, labelled(Inputs, slot)), (slot, interval), by)
         for j in range(model.columns):
             for row in range(model.extras):
                 total = by[row, j - model.extra] if model.extra <= j < model.ring else 0.0

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from cz_gym.body.cost import PULL_TOLERANCE, TOLERANCE
 from cz_gym.body.process import BODY
@@ -53,6 +54,8 @@ class Row:
     """Seed of its first crystal."""
     process: Process = BODY
     """What is simulated."""
+    stage: Any = None
+    """Part of the crystal that is grown, where the process has stages."""
 
     @property
     def control_interval(self) -> float:
@@ -67,8 +70,9 @@ class Row:
         """Return the settings that a controller is designed for: the same on Hurle's meniscus."""
         interval, puller = self.control_interval, self.puller
         return make_config(
-            self.scenario, self.model, observation, interval, action=action, puller=puller, process=self.process
-        )
+            self.scenario, self.model, observation, interval, action=action, puller=puller, process=self.process,
+            stage=self.stage,
+        )  # fmt: skip
 
     @property
     def grown_on(self) -> str:

@@ -252,6 +252,17 @@ def _labelled(kind: Any, record: Any) -> Any:
     return [f"return kind({', '.join(f'record.{name}' for name in kind.instance_class._fields)})"], {}
 
 
+def joined(kind: Any, first: Any, second: Any) -> Any:
+    """A named tuple of this kind whose fields are those of two others, one after the other."""
+    return kind(*first, *second)
+
+
+@compiled_as(joined)
+def _joined(kind: Any, first: Any, second: Any) -> Any:
+    fields = [f"{name}.{each}" for name, part in (("first", first), ("second", second)) for each in part.fields]
+    return [f"return kind({', '.join(fields)})"], {}
+
+
 def set_labelled(kind: Any, values: Any, record: Any) -> None:
     """Write a named tuple of this kind to a record that has its fields."""
     for name in kind._fields:

@@ -20,13 +20,13 @@ from cz_gym.body.plant import make_puller
 from cz_gym.body.task import RADIUS_LIMIT, check_height
 from cz_gym.episodes.scenario import Range
 from cz_gym.errors import CzError
-from cz_gym.physics.parameters import Parameters, check_parameters
+from cz_gym.physics.parameters import Parameters, Recipe, check_parameters
 from cz_gym.physics.quantities import MACHINE, Quantity
 from cz_gym.support.atomic_files import naming, write_files
 from cz_gym.support.names import unknown
 from cz_gym.support.units import CELSIUS, KILO, MM
 
-from .toml_numbers import FORMAT, read_numbers, write_numbers
+from .toml_numbers import FORMAT, OPTIONAL, read_numbers, write_numbers
 
 FOLDER = Path(__file__).parent / "pullers"
 """Folder of the files that ship."""
@@ -48,6 +48,8 @@ class PullerFile:
 
     name: str = "default"
     parameters: Parameters = field(default_factory=Parameters)
+    recipe: Recipe = Recipe()  # noqa: RUF009  (immutable)
+    """The whole crystal that it grows."""
     heater_range: float = HEATER_RANGE
     heater_max: float | None = None
     heater_slew: float | None = None
@@ -105,11 +107,13 @@ class PullerFile:
 
     @cached_property
     def hash(self) -> str:
-        """SHA-256 of everything but the name (16 hex digits)."""
+        """SHA-256 of everything but the name, and the recipe, which is in the plant's hash (16 hex digits)."""
         plain, later = [], {}
         for quantity in MACHINE.values():
             value = value_of(self, quantity)
             value = value if value is None else (np.asarray(value, float) + 0.0).tolist()
+            if quantity.table == OPTIONAL:
+                continue
             if not quantity.later:
                 plain.append(value)
             elif value is not None:
@@ -147,7 +151,8 @@ class PullerFile:
 
 def value_of(puller: PullerFile, quantity: Quantity) -> Any:
     """The number, or range, of a machine's quantity [SI units]; None: the scenario's own."""
-    return getattr(puller.parameters if quantity.symbol in Parameters._fields else puller, quantity.symbol)
+    holders = (holder for holder in (puller.parameters, puller.recipe) if hasattr(holder, quantity.symbol))
+    return getattr(next(holders, puller), quantity.symbol)
 
 
 def read_puller(path: str | Path) -> PullerFile:
@@ -161,8 +166,9 @@ def from_toml(text: str, source: str | Path = "puller") -> PullerFile:
     """The puller of a file's text; CzError, one line that begins with the text's source, for what cannot be meant."""
     try:
         name, numbers, missing = read_numbers(text)
-        parameters = Parameters(**{symbol: numbers.pop(symbol) for symbol in Parameters._fields if symbol in numbers})
-        return PullerFile(Path(source).stem if name is None else name, parameters, **numbers, missing=missing)
+        parts = ({each: numbers.pop(each) for each in kind._fields if each in numbers} for kind in (Parameters, Recipe))
+        parameters, recipe = Parameters(**next(parts)), Recipe(**next(parts))
+        return PullerFile(Path(source).stem if name is None else name, parameters, recipe, **numbers, missing=missing)
     except CzError as error:
         raise CzError(f"{source}: {' '.join(str(error).split())}") from None
 

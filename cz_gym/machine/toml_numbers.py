@@ -22,6 +22,8 @@ TABLES = {
     for table in dict.fromkeys(quantity.table for quantity in MACHINE.values())
 }
 """The tables of the file, and the keys of each."""
+OPTIONAL = "recipe"
+"""The table whose absence needs no word: only ``CzCrystal-v0`` reads it."""
 
 
 def read_numbers(text: str) -> tuple[Any, dict[str, Any], tuple[str, ...]]:
@@ -46,7 +48,8 @@ def read_numbers(text: str) -> tuple[Any, dict[str, Any], tuple[str, ...]]:
             quantity, number = known[key], _read(value, known[key])
             pair = quantity.drawn and not isinstance(number, tuple)
             numbers[quantity.symbol] = (number, number) if pair else number
-        missing += [key for key in known if key not in given]
+        if table in content or table != OPTIONAL:
+            missing += [key for key in known if key not in given]
     return content.get("name"), numbers, tuple(missing)
 
 

@@ -46,10 +46,34 @@ class Parameters(NamedTuple):
     T_e: float = 1300.0
 
 
+class Recipe(NamedTuple):
+    """What a puller grows: charge, shape and growth rate of a whole crystal, and how the crystal gives off its heat.
+
+    SI units; the numbers of the table ``[recipe]`` of a puller file. Only ``CzCrystal-v0`` reads them.
+    """
+
+    M_0: float = 80.0
+    neck_length: float = 150.0 * MM
+    r_start: float = 10.0 * MM
+    crown_length: float = 90.0 * MM
+    body_length: float = 1000.0 * MM
+    tail_length: float = 175.0 * MM
+    v_start: float = 2.0 * MM_PER_MIN
+    v_crown: float = 0.75 * MM_PER_MIN
+    v_body: float = 1.25 * MM_PER_MIN
+    v_body_end: float = 1.0 * MM_PER_MIN
+    v_tail: float = 1.8 * MM_PER_MIN
+    k_s: float = 22.0
+    T_fin: float = 1300.0
+    m: float = 0.5
+    beta: float = 0.15
+    k_0: float = 0.8
+
+
 def describe(kind: type[Any] = Parameters) -> dict[str, Quantity]:
     """Map the name of each field of this kind of tuple to its :class:`Quantity`."""
-    if kind is Parameters:
-        return {name: MACHINE[name] for name in Parameters._fields}
+    if kind in (Parameters, Recipe):
+        return {name: MACHINE[name] for name in kind._fields}
     hints = get_type_hints(kind, include_extras=True)
     return {name: hints[name].__metadata__[0] for name in kind._fields}
 

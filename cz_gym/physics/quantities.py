@@ -5,6 +5,7 @@ the docs and refusals follow from it.
 """
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 from cz_gym.errors import CzError
@@ -15,7 +16,7 @@ SIZES: dict[str, dict[str, float]] = {
     "m/s2": {"mm/min2": MM_PER_MIN / MINUTE, "mm/s2": MM}, "rad": {"deg": math.pi / 180.0}, "1": {"%": PERCENT},
     "K": {"°C": 1.0}, "K/s": {"K/min": 1.0 / MINUTE, "K/h": 1.0 / HOUR}, "s": {"ms": 1e-3, "min": MINUTE},
     "rev/s": {"rpm": 1.0 / MINUTE}, "W": {"kW": KILO, "MW": 1e6}, "W/s": {"kW/min": KILO / MINUTE},
-    "N/m": {"mN/m": 1e-3}, "kg/m3": {"g/cm3": KILO}, "J/kg": {"kJ/kg": KILO}, "J/K": {"kJ/K": KILO},
+    "N/m": {"mN/m": 1e-3}, "kg": {"g": 1e-3}, "kg/m3": {"g/cm3": KILO}, "J/kg": {"kJ/kg": KILO}, "J/K": {"kJ/K": KILO},
     "W/K": {"kW/K": KILO}, "W/m/K": {"W/cm/K": 100.0}, "W/K4": {}, "W/m2/K4": {},
 }  # fmt: skip
 """Each SI unit, with the units that users may state or mean instead, and their sizes in it."""
@@ -94,6 +95,7 @@ class Quantity(NamedTuple):
 
 Q = Quantity
 _L, _E, _II = "silicon literature", "estimate", "Bukhari, Hovd, Winkler, Part II"
+_V, _R = f"{_E}: set points of public simulators", partial(Quantity, later=True)
 MAX_LATENCY = 60.0
 """Oldest camera frame that a machine may deliver [s]."""
 MAX_LAG = 300.0
@@ -163,6 +165,28 @@ _TABLES: dict[str, dict[str, Quantity]] = {
                             "each drawn on its own", "", 0.0, 100.0, drawn=True),
         "tau_fast": Q("s", "correlation time of the fast fluctuation", "", 0.1, 1e5),
         "tau_slow": Q("s", "correlation time of the slow fluctuation", "", 0.1, 1e6),
+    },
+    "recipe": {
+        "M_0": _R("kg", "charge of the crucible", _E, 0.1, 2e3, "charge"),
+        "neck_length": _R("mm", "length of the neck before the crown, as wide as the start", _E, 30.0, 1e3),
+        "r_start": _R("mm", "radius of the neck, and of the tail's end", "shape of this project", 1.0, 100.0,
+                      "start_radius"),
+        "crown_length": _R("mm", "length of the crown", "shape of this project", 5.0, 500.0),
+        "body_length": _R("mm", "length of the body", "shape of this project", 0.0, 5e3),
+        "tail_length": _R("mm", "length of the tail", "shape of this project", 5.0, 1e3),
+        "v_start": _R("mm/min", "growth rate at the crown's start", _V, 0.005, 30.0, "start_rate"),
+        "v_crown": _R("mm/min", "growth rate in the crown", _V, 0.005, 30.0, "crown_rate"),
+        "v_body": _R("mm/min", "growth rate at the body's start", _V, 0.005, 30.0, "body_rate"),
+        "v_body_end": _R("mm/min", "growth rate at the body's end", _V, 0.005, 30.0, "body_end_rate"),
+        "v_tail": _R("mm/min", "growth rate in the tail", _V, 0.005, 30.0, "tail_rate"),
+        "k_s": _R("W/m/K", "thermal conductivity of the crystal at its melting point", _L, 0.1, 1e3),
+        "T_fin": _R("K", "temperature that the crystal's wall radiates to", f"{_E}, 1100-1450", 0.0, 3e3),
+        "m": _R("1", "exponent of the crystal's heat flux in r_0/r_c", f"{_E}, 0 to 1/2: a radiating cylinder", 0.0,
+                2.0, "flux_exponent"),
+        "beta": _R("1", "share of the crystal's heat flux that falls with the melt's depth", f"{_E}, 0 to 0.3", 0.0,
+                   0.9, "depth_share"),
+        "k_0": _R("1", "segregation coefficient of the dopant", "literature: boron in silicon", 1e-9, 10.0,
+                  "segregation"),
     },
 }  # fmt: skip
 MACHINE: dict[str, Quantity] = {

@@ -25,8 +25,8 @@ SMALLEST, LARGEST = 360, 3840
 
 
 def declared_modes(process: Process = BODY) -> list[str]:
-    """The render modes that can be drawn here: none without pygame, or for a process without a crystal's signals."""
-    return list(MODES) if available() and set(process.info) >= DRAWN else []
+    """The render modes that can be drawn here: none without pygame, and those of a crystal's body alone."""
+    return list(MODES) if available() and set(process.info) >= DRAWN and not process.table[0] else []
 
 
 def check_size(size: Any) -> tuple[int, int]:
@@ -51,7 +51,7 @@ def make_view(render_mode: str | None, size: Any, config: Config) -> "View | Non
     if not available():
         raise DependencyNotInstalled(MISSING)
     if not declared_modes(config.process):
-        raise CzError("a picture shows a crystal on its melt: this process has none, so render_mode must be None")
+        raise CzError("a picture shows the body of a crystal on its melt: for this process render_mode must be None")
     return View(render_mode, width, height, config)
 
 

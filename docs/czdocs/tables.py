@@ -15,6 +15,7 @@ from typing import Any
 from cz_gym import SCENARIOS, Scenario
 from cz_gym.body.signals import INFO_ROWS, PULL_SCALE
 from cz_gym.camera.view import Camera
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.episodes.scenario import FAMILIES
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.machine.puller import DEFAULT, value_of
@@ -182,6 +183,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "history": remembered,
     "state": lambda: channels(STATE),
     "info": info,
+    "crystal-measured": lambda: channels(CRYSTAL.measured),
     "scenarios": lambda: scenario_table([s for s in SCENARIOS.values() if not s.deterministic and not _single(s)]),
     "plain-scenarios": lambda: scenario_table([s for s in SCENARIOS.values() if s.deterministic]),
     "single-scenarios": single_scenarios,

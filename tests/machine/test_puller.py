@@ -26,7 +26,7 @@ from cz_gym.machine.puller import (
     value_of,
     write_puller,
 )
-from cz_gym.physics.parameters import Parameters
+from cz_gym.physics.parameters import Parameters, Recipe
 from cz_gym.physics.quantities import MACHINE
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
 from tests.observed import PLAIN
@@ -44,19 +44,21 @@ def file(folder, text):
 
 @st.composite
 def pullers(draw):
-    parameters, own = {}, {}
+    parameters, recipe, own = {}, {}, {}
     for symbol, quantity in MACHINE.items():
         if symbol in AS_THEY_ARE:
             continue
-        middle, part = value_of(DEFAULT, quantity), parameters if symbol in Parameters._fields else own
+        parts = (part for part, kind in ((parameters, Parameters), (recipe, Recipe)) if symbol in kind._fields)
+        middle, part = value_of(DEFAULT, quantity), next(parts, own)
         low, high = (max(quantity.low, -100.0) * quantity.size, min(quantity.high, 100.0) * quantity.size)
-        if part is parameters:
+        if part is not own:
             low, high = 0.9 * middle, 1.1 * middle
         value = draw(st.none() | st.floats(low, high, allow_subnormal=False))
         if value is not None:
             other = draw(st.floats(low, high, allow_subnormal=False))
             part[symbol] = tuple(sorted((value, other))) if quantity.drawn else value
-    return PullerFile(draw(st.sampled_from(["my puller", "Züchtung 3", '"q"\\'])), Parameters(**parameters), **own)
+    name = draw(st.sampled_from(["my puller", "Züchtung 3", '"q"\\']))
+    return PullerFile(name, Parameters(**parameters), Recipe(**recipe), **own)
 
 
 @settings(max_examples=60, deadline=None)

@@ -1,0 +1,1 @@
+"""Controllers of a whole crystal, whose gains and compensation run with its length."""

@@ -1,0 +1,183 @@
+"""A linear quadratic Gaussian regulator of a whole crystal: Kalman filter and regulator at each length of the recipe.
+
+Both are solved for the linearisation at some lengths, as if the crystal stayed there, and interpolated between. The
+model has half conduction and half convection, and three states that are not the plant's: the interface's slow
+fluctuation, a heat load on the melt, and the error of the recipe's temperature. SI units.
+"""
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from scipy.linalg import expm, solve_discrete_are
+
+from cz_gym.baselines.policy import Floats, MeasuredController
+from cz_gym.crystal.linearisation import along
+from cz_gym.crystal.process import CRYSTAL
+from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.process import Process
+from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN
+
+PLANT, EXOGENOUS, DRIVES = 5, 3, 2
+STATES = PLANT + EXOGENOUS
+"""r_c, h_c, T_1, T_2, T_b, then the fluctuation [K], the load [W] and the recipe's error [K]."""
+_SIZES = np.array([MM, MM, *[1.0] * 4, KILO, 1.0, MM_PER_MIN, KILO])
+"""Sizes of the states and the drives, in SI units."""
+
+
+class Noise(NamedTuple):
+    """What the filter expects."""
+
+    ring: float = 0.06 * MM
+    """Noise of the ring [m]."""
+    pyrometer: float = 0.1
+    """Noise of the pyrometer [K]."""
+    height: float = 2.0e-7
+    """Walk of the height, for what the model lacks [m/sqrt(s)]."""
+    temperature: float = 3.0e-3
+    """Walk of each temperature [K/sqrt(s)]."""
+    fluctuation: float = 0.4
+    """Standard deviation of the interface's fluctuation [K]."""
+    tau: float = 400.0
+    """Correlation time of the interface's fluctuation [s]."""
+    load: float = 300.0
+    """Standard deviation of the heat load on the melt [W]."""
+    recipe: float = 4.0
+    """Standard deviation of the recipe's error [K]."""
+    slow: float = 2.0 * HOUR
+    """Correlation time of load and recipe's error [s]."""
+
+
+class Weights(NamedTuple):
+    """What the regulator weighs: deviations that cost 1."""
+
+    radius: float = 0.5 * MM
+    height: float = 0.4 * MM
+    pull: float = 0.3 * MM_PER_MIN
+    pull_step: float = 0.06 * MM_PER_MIN
+    power: float = 4.0 * KILO
+    power_step: float = 1.0 * KILO
+
+
+class Gains(NamedTuple):
+    """Model, filter and regulator at lengths L [m]: each of shape (lengths, rows, columns)."""
+
+    L: Floats
+    A: Floats
+    B: Floats
+    C: Floats
+    K: Floats
+    """From innovations to states."""
+    F: Floats
+    """From states and last drives to drives."""
+
+
+@lru_cache(maxsize=8)
+def design(parameters: Any, meniscus: MeniscusModel, dt: float, lam: float, noise: Noise, weights: Weights) -> Gains:
+    """Design filter and regulator for a control interval [s]."""
+    at = along(parameters, meniscus, lam)
+    designs = [_at(A, B, C, dt, noise, weights) for A, B, C in zip(at.A, at.B, at.C, strict=True)]
+    return Gains(at.L, *(np.stack(each) for each in zip(*designs, strict=True)))
+
+
+def _at(A: Floats, B: Floats, C: Floats, dt: float, noise: Noise, weights: Weights) -> tuple[Floats, ...]:
+    """A, B and C in discrete time, K and F at one length."""
+    rates = 1.0 / np.array([noise.tau, noise.slow, noise.slow])
+    whole = np.zeros((STATES + DRIVES, STATES + DRIVES))
+    whole[:PLANT, :PLANT], whole[:PLANT, STATES:] = A, B[:, :DRIVES]
+    whole[:PLANT, PLANT], whole[:PLANT, PLANT + 1] = B[:, 3], B[:, 2]
+    whole[PLANT:STATES, PLANT:STATES] = -np.diag(rates)
+    moved = expm(whole * dt)
+    F_d, B_d = moved[:STATES, :STATES], moved[:STATES, STATES:]
+    seen = np.zeros((2, STATES))
+    seen[0, :PLANT], seen[1, 2], seen[1, STATES - 1] = C, 1.0, -1.0
+    walks = np.array([1e-9, noise.height, *[noise.temperature] * 3])
+    sizes = np.array([noise.fluctuation, noise.load, noise.recipe])
+    Q = np.diag([*walks**2 * dt, *sizes**2 * (1.0 - np.exp(-2.0 * rates * dt))])
+    R = np.diag([noise.ring**2, noise.pyrometer**2])
+    P = _solve(F_d.T, seen.T, Q, R, 1.0 / _SIZES[:STATES], 1.0 / np.array([MM, 1.0]))
+    K = P @ seen.T @ np.linalg.inv(seen @ P @ seen.T + R)
+    return F_d, B_d, seen, K, _regulator(F_d, B_d, weights)
+
+
+def _regulator(A: Floats, B: Floats, weights: Weights) -> Floats:
+    """From states and last drives to drives: least mean cost of radius, drives and their steps."""
+    n = STATES + DRIVES
+    move, act, cost, cross = np.zeros((n, n)), np.zeros((n, DRIVES)), np.zeros((n, n)), np.zeros((n, DRIVES))
+    move[:STATES, :STATES], act[:STATES], act[STATES:] = A, B, np.eye(DRIVES)
+    cost[0, 0], cost[1, 1] = weights.radius**-2.0, weights.height**-2.0
+    steps = np.diag([weights.pull_step**-2.0, weights.power_step**-2.0])
+    cost[STATES:, STATES:], cross[STATES:] = steps, -steps
+    drives = steps + np.diag([weights.pull**-2.0, weights.power**-2.0])
+    S = _solve(move, act, cost, drives, _SIZES, _SIZES[STATES:], cross)
+    gain = np.linalg.solve(drives + act.T @ S @ act, act.T @ S @ move + cross.T)
+    return np.asarray(-gain, np.float64)
+
+
+def _solve(A: Floats, B: Floats, Q: Floats, R: Floats, x: Floats, u: Floats, S: Floats | None = None) -> Floats:
+    """Solve the Riccati equation in numbers of order one: x and u are the sizes of states and inputs."""
+    scaled = solve_discrete_are(
+        A * np.outer(1.0 / x, x), B * np.outer(1.0 / x, u), Q * np.outer(x, x), R * np.outer(u, u),
+        s=None if S is None else S * np.outer(x, u),
+    )  # fmt: skip
+    solved: Floats = scaled * np.outer(1.0 / x, 1.0 / x)
+    return solved
+
+
+class Memory(NamedTuple):
+    """The memory of :class:`CrystalLQG`."""
+
+    x: Floats
+    """Estimated states, shape (n, 8)."""
+
+
+@dataclass(frozen=True)
+class CrystalLQG(MeasuredController):
+    """The regulator on the filter's estimate; what the camera does not see is not corrected while it is blind."""
+
+    process: ClassVar[Process] = CRYSTAL
+
+    lam: float = 0.5
+    """Share of conduction in its model [-]."""
+    noise: Noise = field(default_factory=Noise)
+    weights: Weights = field(default_factory=Weights)
+    jump: float = 1.0 * MM
+    """Largest innovation of the ring that counts [m]."""
+
+    def at_rest(self, seen: Any) -> Memory:
+        """On the recipe, as far as the first sample tells."""
+        x = np.zeros((len(seen.L), STATES))
+        x[:, STATES - 1] = seen.T_1_ref - seen.T_1
+        return Memory(x)
+
+    def step(self, seen: Any, memory: Memory) -> tuple[Floats, Floats, Memory]:
+        """Pull speed and heater power above the recipe's, and the new memory."""
+        at = design(self.parameters, self.meniscus, self.control_interval, self.lam, self.noise, self.weights)
+        u = np.stack([seen.v_p, seen.Q_H], axis=1)
+        near, share = _between(at.L, seen.L)
+        A, B, C, K, F = (_mix(each, near, share) for each in at[1:])
+        x = _times(A, memory.x) + _times(B, u)
+        told = np.stack([seen.ring_error, seen.T_1 - seen.T_1_ref], axis=1) - _times(C, x)
+        told[:, 0] = np.where(seen.valid > 0.5, np.clip(told[:, 0], -self.jump, self.jump), 0.0)
+        x = x + _times(K, told)
+        drives = _times(F, np.concatenate([x, u], axis=1))
+        return drives[:, 0], drives[:, 1], Memory(x)
+
+
+def _between(L: Floats, at: Floats) -> tuple[Any, Floats]:
+    """The design before each length, and the share of the way to the next."""
+    place = np.clip((at - L[0]) / (L[1] - L[0]), 0.0, len(L) - 1.0 - 1e-9)
+    near = place.astype(np.int64)
+    return near, (place - near)[:, None, None]
+
+
+def _mix(gains: Floats, near: Any, share: Floats) -> Floats:
+    mixed: Floats = gains[near] + share * (gains[near + 1] - gains[near])
+    return mixed
+
+
+def _times(matrices: Floats, vectors: Floats) -> Floats:
+    """A matrix a crystal times a vector a crystal."""
+    product: Floats = np.einsum("nij,nj->ni", matrices, vectors)
+    return product

@@ -1,0 +1,83 @@
+"""The crystal's plant along its recipe as control engineers write it: deviations from the recipe at each length.
+
+The references run with the length, so a deviation is that from the recipe at the length that has been reached. With L
+as clock, x' = f(x, u) and L' = v_g(x), it moves by A = df/dx - (f / v_g) dv_g/dx at the recipe, and so does B.
+"""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.episodes.record import Episode
+from cz_gym.physics.linearisation import linearise
+from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.process import Inputs
+
+from . import recipe
+from .parameters import APART
+from .plant import NO_DISTURBANCE, State, rates
+from .process import CRYSTAL, nominal_recipe
+from .task import end
+
+Floats = npt.NDArray[np.float64]
+STATES = State._fields[:5]
+"""Rows and columns of A: what changes within minutes; area, mass and dopant are the recipe's."""
+INPUTS = (*Inputs._fields, "Q_d", "dT_i")
+"""Columns of B."""
+_POINTS = 256
+
+
+class Along(NamedTuple):
+    """The linearisation at lengths L [m], each of shape (points, ...)."""
+
+    L: Floats
+    A: Floats
+    """Shape (points, 5, 5)."""
+    B: Floats
+    """Shape (points, 5, 4)."""
+    C: Floats
+    """The bright ring by the states, shape (points, 5)."""
+
+    @property
+    def a_h(self) -> Floats:
+        """Rate with which the height's deviation dies out [rad/s]."""
+        return -self.A[:, 1, 1]
+
+    @property
+    def c_h(self) -> Floats:
+        """The ring by the height [-]."""
+        return self.C[:, 1]
+
+    @property
+    def zero(self) -> Floats:
+        """Zero from pull speed to ring at constant temperature [rad/s]: the inverse response where it is positive."""
+        rate: Floats = self.A[:, 0, 0] - self.C[:, 0] * self.A[:, 0, 1] / self.C[:, 1]
+        return rate
+
+
+@lru_cache(maxsize=16)
+def along(parameters: Any, meniscus: MeniscusModel, lam: float = 1.0) -> Along:
+    """Linearise the design puller along its recipe, with this share of conduction [-]."""
+    p, table = nominal_recipe(parameters._replace(**dict.fromkeys(APART, 0.0)), meniscus, lam)
+    lengths = np.linspace(0.0, end(p), _POINTS)
+    points = [_at(float(L), table, p, meniscus) for L in lengths]
+    return Along(lengths, *(np.stack(each) for each in zip(*points, strict=True)))
+
+
+def _at(L: float, table: Floats, p: Any, m: MeniscusModel) -> tuple[Floats, Floats, Floats]:
+    """A, B and C at a length."""
+    row, share = recipe.place(L, p)
+    x = State(*map(float, recipe.state_at(L, table, p, Episode())))
+    u = Inputs(*(float(recipe.look_up(table, row, share, at)) for at in (recipe._v_p, recipe._Q_H)))
+
+    def ring(x: Any, u: Any, d: Any) -> Any:
+        return (x.r_c + m.ring_offset(x.r_c, x.h_c, p),)
+
+    model = linearise(CRYSTAL, p, m, (x, u, NO_DISTURBANCE), INPUTS[2:], ring)
+    moves, n, length = np.array(rates(x, u, NO_DISTURBANCE, p, m)), len(STATES), State._fields.index("L")
+    drift = moves[:n] / moves[length]
+    A = model.A[:n, :n] - np.outer(drift, model.A[length, :n])
+    B = model.B[:n] - np.outer(drift, model.B[length])
+    return A, B, model.C[0, :n]

@@ -1,0 +1,216 @@
+"""The process of ``CzCrystal-v0``: plant, recipe, signals and task of a whole crystal as one value for the engine."""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.body import cost
+from cz_gym.body.plant import hidden_load
+from cz_gym.body.task import HEIGHT_MAX_IN_A
+from cz_gym.episodes.record import Episode, Factors
+from cz_gym.episodes.scenario import DRAW_SPAN
+from cz_gym.episodes.schedule import bias_offset
+from cz_gym.errors import CzError
+from cz_gym.jit.compile import jittable
+from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.physics.parameters import check_parameters
+from cz_gym.process import NO_OPERATING_POINT, Inputs, Process, Seen
+from cz_gym.support.units import KILO, MM
+
+from . import plant, recipe, signals, task
+from .parameters import APART, STAGES, check_shape, complete, parts
+from .plant import Disturbance, State, at_interface
+from .shape import growth_rate, shape_at
+
+SLACK = 1.3
+"""Time that an episode may last, in multiples of the recipe's [-]."""
+Floats = npt.NDArray[np.float64]
+
+
+class Extra(NamedTuple):
+    """Numbers besides the state that outlive a step."""
+
+    v_p_mean: Any
+    """Exponential mean of the pull speed minus the recipe's over :data:`cz_gym.body.cost.PULL_MEMORY` [m/s]."""
+    stop: Any
+    """Length at which the episode ends with success [m]."""
+
+
+@lru_cache(maxsize=64)
+def nominal_recipe(parameters: Any, meniscus: MeniscusModel, lam: float = 1.0) -> tuple[Any, Floats]:
+    """The constants of the design puller and its recipe's table (:class:`cz_gym.crystal.recipe.Setpoint`)."""
+    with np.errstate(all="ignore"):
+        p = plant.Crystal(*map(float, plant.derive(parameters, Factors(lam=lam), meniscus)))
+        if not np.all(np.isfinite(p)):
+            raise CzError(NO_OPERATING_POINT)
+        table = np.zeros(recipe.TABLE)
+        recipe.fill(table, p, Episode(), meniscus)
+    table.setflags(write=False)
+    return p, table
+
+
+def lengths(p: Any) -> Floats:
+    """Lengths [m] of the table's rows."""
+    return np.asarray((np.arange(recipe.ROWS) - recipe.MARGIN) * recipe.spacing(p))
+
+
+def check(parameters: Any, meniscus: MeniscusModel) -> Any:
+    """Return the parameters; raise CzError, with the length where it fails, unless the whole crystal can be grown."""
+    given, growth = parts(parameters)
+    checked = parameters._replace(**check_parameters(given)._asdict())
+    check_shape(checked)
+    p, table = nominal_recipe(checked._replace(**dict.fromkeys(APART, 0.0)), meniscus)
+    at = recipe.Setpoint(*table.T)
+    left = growth.M_0 - at.M_s - at.M_men
+    for fails, what in (
+        (left <= 0.0, f"the charge of {growth.M_0:g} kg is used up: the crystal weighs {at.M_s[-1]:.3g} kg"),
+        (~((at.h_c >= task.HEIGHT_MIN) & (at.h_c <= HEIGHT_MAX_IN_A * p.a)), "the meniscus is out of its range"),
+        (np.isnan(at.ring), f"the meniscus {meniscus.name!r} does not hold ({meniscus.covers})"),
+        (~(at.T_b > p.T_m), "the melt would have to be colder than its melting point: less growth rate there"),
+        (~(at.v_p > 0.0), "the pull speed is not positive"),
+        (~(at.Q_H > 0.0), "the heater's power is not positive"),
+        (checked.heater_max < at.Q_H, f"the heater needs more than heater_max_kW = {checked.heater_max / KILO:g}"),
+    ):
+        if fails.any():
+            length = max(float(lengths(p)[np.argmax(fails)]), 0.0) / MM
+            raise CzError(f"this crystal cannot be grown: at a length of {length:.0f} mm {what}")
+    return checked
+
+
+def duration(parameters: Any, meniscus: MeniscusModel) -> float:
+    """The longest stage's time along the recipe, times :data:`SLACK` [s]."""
+    p, table = nominal_recipe(parameters._replace(**dict.fromkeys(APART, 0.0)), meniscus)
+    p = p._replace(begins=parameters.begins)
+    longest = 0.0
+    for stage, name in enumerate(STAGES):
+        if getattr(parameters, name) > 0.0:
+            start, stop = task.span(stage, 0.0, table, p)
+            longest = max(longest, float(task.time_at(stop, table, p) - task.time_at(start, table, p)))
+    return SLACK * longest
+
+
+@jittable
+def begin(slot: Any, m: Any) -> Any:
+    """The recipe of the drawn puller, and the state on it where the drawn stage begins, the radius off by what was
+    drawn."""
+    p, table = slot.puller, slot.table
+    task.reference_along(slot)
+    recipe.fill(table, p, slot.episode, m)
+    stage, u = task.draw_stage(slot)
+    start, stop = task.span(stage, u, table, p)
+    slot.stop, slot.v_p_mean = stop, 0.0
+    task.stretch(slot, (task.time_at(stop, table, p) - task.time_at(start, table, p)) / DRAW_SPAN)
+    x = recipe.state_at(start, table, p, slot.episode)
+    return State(x.r_c + slot.episode.r_c_start, x.h_c, x.T_1, x.T_2, x.T_b, x.L, x.A_s, x.M_s, x.N)
+
+
+@jittable
+def nominal(x: Any, slot: Any, interval: Any) -> Any:
+    """The recipe's inputs at the length of the interval's middle: held inputs would else lag behind it."""
+    p = slot.puller
+    row, share = recipe.place(x.L + 0.5 * interval * growth_rate(x.L, p), p)
+    return Inputs(
+        recipe.look_up(slot.table, row, share, recipe._v_p), recipe.look_up(slot.table, row, share, recipe._Q_H)
+    )
+
+
+@jittable
+def disturb(Q_d: Any, dT_i: Any, t: Any, e: Any) -> Any:
+    """The disturbance: the melt that is left follows from the state."""
+    return Disturbance(Q_d, dT_i)
+
+
+@jittable
+def see(x: Any, p: Any, m: Any) -> Any:
+    """The bright ring around the crystal and the heater; the recipe's ring is subtracted later, at the length grown."""
+    h_c = task.height_inside(x.h_c, p)
+    ring = x.r_c + m.ring_offset(x.r_c, h_c, p)
+    return Seen(ring, ring, h_c, x.T_1)
+
+
+@jittable
+def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, m: Any) -> Any:
+    """The rows of ``info``, growth taken at a height within the limits."""
+    p, x = slot.puller, slot.x
+    at = State(x.r_c, task.height_inside(x.h_c, p), x.T_1, x.T_2, x.T_b, x.L, x.A_s, x.M_s, x.N)
+    return signals.logged(slot, measured, cost, t, ring, at_interface(at, Disturbance(slot.Q_d, slot.dT_i), p, m.slope))
+
+
+@jittable
+def lean(slot: Any, measured: Any) -> Any:
+    """True radius, its reference, whether the crystal is out of tolerance, and whether it is long enough."""
+    return signals.Lean(
+        slot.x.r_c,
+        slot.puller.r_0 + measured.r_ref,
+        signals.out_of_tolerance(slot, measured),
+        signals.succeeded(slot),
+    )
+
+
+@jittable
+def carry(extra: Any, u: Any, slot: Any, interval: Any) -> Any:
+    """The mean pull speed above the recipe's after an interval."""
+    return Extra(cost.moved_mean(extra.v_p_mean, u.v_p - slot.v_p_nominal, interval), extra.stop)
+
+
+@jittable
+def charged(x: Any, u: Any, before: Any, extra: Any, slot: Any, t: Any) -> Any:
+    """True radius error less what no sensor shows [m], mean pull speed above the recipe's, steps of both drives."""
+    p, e = slot.puller, slot.episode
+    error = x.r_c - shape_at(x.L, p, e).r + bias_offset(t, e)
+    return cost.Cost(error, extra.v_p_mean / p.v_0, u.v_p - before.v_p, u.Q_H - before.Q_H)
+
+
+def points(p: Any) -> list[tuple[State, Inputs, Disturbance]]:
+    """Crystals off the body's operating point, at four lengths, with drives and disturbances off nominal."""
+    sides = ((0.15, 0.8, 0.0, 9.0), (0.7, 0.4, 0.2, 4.0), (1.02, 0.9, 0.5, -3.0), (0.5, 1.2, 0.9, 6.0))
+    return [
+        (
+            State(wide * p.r_0, high * p.h_0, p.T_1_0 + warm, p.T_2_0 + warm, p.T_b_0 + 0.2 * warm, share * task.end(p),
+                  0.02 + share, 0.7 * share * p.M_0, 1.0 - 0.6 * share),
+            Inputs(wide * p.v_0, high * p.Q_H_0),
+            Disturbance(100.0 * warm, 0.1 * warm),
+        )
+        for wide, high, share, warm in sides
+    ]  # fmt: skip
+
+
+CRYSTAL = Process(
+    Constants=plant.Crystal,
+    State=State,
+    Disturbance=Disturbance,
+    Measured=signals.Measured,
+    TrueState=signals.TrueState,
+    Logged=signals.Logged,
+    Lean=signals.Lean,
+    Cost=cost.Cost,
+    past=signals.PAST,
+    relative=signals.RELATIVE,
+    check=check,
+    derive=plant.derive,
+    begin=begin,
+    nominal=nominal,
+    hidden_load=hidden_load,
+    disturb=disturb,
+    rates=plant.rates,
+    accept=task.accept,
+    see=see,
+    measure=signals.measure,
+    true_state=signals.true_state,
+    logged=logged,
+    lean=lean,
+    charged=charged,
+    cost_terms=cost.cost_terms,
+    cost_slopes=cost.cost_slopes,
+    reward=cost.reward,
+    points=points,
+    weights=cost.WEIGHTS,
+    Extra=Extra,
+    carry=carry,
+    table=recipe.TABLE,
+    complete=complete,
+    apart=APART,
+    duration=duration,
+)

@@ -1,0 +1,288 @@
+"""The table of signals of a whole crystal, as :mod:`cz_gym.body.signals` is of a body.
+
+References are those of the length that has grown: against time the gain from pull speed to radius would change sign in
+the crown.
+"""
+
+import math
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.body.cost import outside
+from cz_gym.episodes.schedule import bias_offset, drift
+from cz_gym.jit.compile import jittable
+from cz_gym.physics.meniscus import hurle_slope
+from cz_gym.process import DONE, HEATER_SCALE, PULL_SCALE, Past, Relative, signals
+from cz_gym.process import Channel as Channel
+from cz_gym.support.units import KILO, MINUTE, MM
+
+from . import recipe
+from .plant import meniscus_mass
+from .recipe import value
+from .shape import shape_at
+from .task import end, height_inside
+
+NEAR, FAR = 5.0 * MM, 25.0 * MM
+"""Lengths ahead for which the recipe is observed [m]."""
+CONSTANT_ERROR, WAVE_ERROR, WAVELENGTH = 1.36, 1.28, 0.3
+"""The recipe's error along the crystal, in multiples of the final error that the scenario draws: a constant, and the
+amplitude of a wave of this length [m]. On "randomized" their standard deviations are 3 K and 2 K."""
+_ONE_WAVE = 100.0 * MINUTE
+"""Start of the scenario's error that shifts the wave by its whole length [s]."""
+WEIGHT_STEP = 0.01
+"""Resolution of the load cell [kg]."""
+_T, _R = 10.0, 20.0 * MM
+
+
+@jittable
+def recipe_error(L: Any, e: Any) -> Any:
+    """Error of the heater temperature in the recipe that is given, at a length [K]."""
+    wave = np.sin(2.0 * math.pi * (L / WAVELENGTH + e.recipe_start / _ONE_WAVE))
+    return e.recipe_amount * (CONSTANT_ERROR + WAVE_ERROR * wave)
+
+
+@jittable
+def weight(x: Any, p: Any) -> Any:
+    """What hangs on the load cell [N]: crystal and meniscus, at Hurle's angle, in whole steps of its resolution."""
+    h_c = height_inside(x.h_c, p)
+    M_men = meniscus_mass(x.r_c, h_c, hurle_slope(x.r_c, h_c, p)[1], p)
+    return p.g * WEIGHT_STEP * np.rint((x.M_s + M_men) / WEIGHT_STEP)
+
+
+class Measured(NamedTuple):
+    """What a puller's control computer knows, in SI units; arrays of the batch's shape where decoded.
+
+    Radii count from r_0, temperatures and the recipe's drives from the body's operating point.
+    """
+
+    ring_error: Annotated[
+        Any, Channel("m", MM, "camera reading minus the recipe's ring at this length; the last valid one while invalid")
+    ]
+    valid: Annotated[Any, Channel("1", 1.0, "1 if the camera says this reading is good, else 0")]
+    r_ref: Annotated[Any, Channel("m", _R, "radius reference minus r_0, at this length")]
+    r_ref_5mm: Annotated[Any, Channel("m", _R, "the same 5 mm later")]
+    r_ref_25mm: Annotated[Any, Channel("m", _R, "the same 25 mm later")]
+    T_1_ref: Annotated[Any, Channel("K", _T, "recipe of the heater temperature minus nominal, at this length")]
+    T_1_ref_5mm: Annotated[Any, Channel("K", _T, "the same 5 mm later")]
+    T_1_ref_25mm: Annotated[Any, Channel("K", _T, "the same 25 mm later")]
+    T_1: Annotated[Any, Channel("K", _T, "pyrometer reading minus nominal")]
+    v_p: Annotated[Any, Channel("m/s", PULL_SCALE, "applied pull speed minus the recipe's; the scale is v_0")]
+    Q_H: Annotated[Any, Channel("W", HEATER_SCALE, "applied heater power minus the recipe's")]
+    v_p_mean: Annotated[Any, Channel("m/s", 0.05 * PULL_SCALE, "exponential 30 min mean of v_p; the scale is v_0 / 20")]
+    alpha_ref: Annotated[Any, Channel("rad", 0.5, "cone angle of the recipe")]
+    L: Annotated[Any, Channel("m", 0.2, "length grown since the crown began")]
+    v_p_ref: Annotated[Any, Channel("m/s", PULL_SCALE, "the recipe's pull speed minus v_0; the scale is v_0")]
+    Q_H_ref: Annotated[Any, Channel("W", HEATER_SCALE, "the recipe's heater power minus nominal")]
+    weight: Annotated[Any, Channel("N", 5.0, "weight of crystal and meniscus minus the recipe's at this length")]
+
+
+@jittable
+def measure(slot: Any, t: Any) -> Any:
+    """:class:`Measured` of a slot at its sample's time t [s]."""
+    p, e, L = slot.puller, slot.episode, slot.x.L
+    near, far = min(L + NEAR, end(p)), min(L + FAR, end(p))
+    now, shift = shape_at(L, p, e), drift(t, e) - p.T_1_0
+    return Measured(
+        ring_error=slot.ring - now.r - value(L, slot, recipe._ring),
+        valid=slot.valid,
+        r_ref=now.r - p.r_0,
+        r_ref_5mm=shape_at(near, p, e).r - p.r_0,
+        r_ref_25mm=shape_at(far, p, e).r - p.r_0,
+        T_1_ref=value(L, slot, recipe._T_1) + recipe_error(L, e) + shift,
+        T_1_ref_5mm=value(near, slot, recipe._T_1) + recipe_error(near, e) + shift,
+        T_1_ref_25mm=value(far, slot, recipe._T_1) + recipe_error(far, e) + shift,
+        T_1=slot.T_1 - p.T_1_0,
+        v_p=slot.v_p - slot.v_p_nominal,
+        Q_H=slot.Q_H - slot.Q_H_nominal,
+        v_p_mean=slot.v_p_mean,
+        alpha_ref=np.arctan(now.slope),
+        L=L,
+        v_p_ref=slot.v_p_nominal - p.v_0,
+        Q_H_ref=slot.Q_H_nominal - p.Q_H_0,
+        weight=weight(slot.x, p) - p.g * (value(L, slot, recipe._M_s) + value(L, slot, recipe._M_men)),
+    )
+
+
+_SHARED = signals(Measured)
+
+
+class TrueState(NamedTuple):
+    """The true state and the disturbances; deviations, SI units. For bounds and for training; no agent acts on it."""
+
+    r_c_error: Annotated[Any, Channel("m", MM, "true radius minus the recipe's at this length")]
+    h_c: Annotated[Any, Channel("m", MM, "true meniscus height minus the recipe's")]
+    T_1: Annotated[Any, Channel("K", 5.0, "true heater temperature minus the perfect recipe's")]
+    T_2: Annotated[Any, Channel("K", 5.0, "true susceptor temperature minus the perfect recipe's")]
+    T_b: Annotated[Any, Channel("K", 5.0, "true melt temperature minus the perfect recipe's")]
+    r_ref: Annotated[Any, _SHARED["r_ref"]]
+    r_ref_5mm: Annotated[Any, _SHARED["r_ref_5mm"]]
+    r_ref_25mm: Annotated[Any, _SHARED["r_ref_25mm"]]
+    T_1_ref: Annotated[
+        Any, Channel("K", 5.0, "recipe of the heater temperature, as it is given, minus the perfect one")
+    ]
+    v_p: Annotated[Any, _SHARED["v_p"]]
+    Q_H: Annotated[Any, _SHARED["Q_H"]]
+    v_p_mean: Annotated[Any, _SHARED["v_p_mean"]]
+    alpha_ref: Annotated[Any, _SHARED["alpha_ref"]]
+    L: Annotated[Any, _SHARED["L"]]
+    v_p_ref: Annotated[Any, _SHARED["v_p_ref"]]
+    Q_H_ref: Annotated[Any, _SHARED["Q_H_ref"]]
+    M_s: Annotated[Any, Channel("kg", 0.5, "true mass of the crystal minus the recipe's at this length")]
+    dT_i: Annotated[Any, Channel("K", 1.0, "interface fluctuation now")]
+    Q_d: Annotated[Any, Channel("W", KILO, "heat load on the melt now")]
+    ring_offset: Annotated[Any, Channel("m", MM, "offset of the ring that no sensor shows")]
+    lam: Annotated[Any, Channel("1", 1.0, "share of conduction: 1 is Model I, 0 is Model II")]
+
+
+@jittable
+def true_state(slot: Any, measured: Any, t: Any) -> Any:
+    """:class:`TrueState` of a slot at its sample's time t [s]."""
+    p, x, L = slot.puller, slot.x, slot.x.L
+    return TrueState(
+        r_c_error=x.r_c - p.r_0 - measured.r_ref,
+        h_c=x.h_c - value(L, slot, recipe._h_c),
+        T_1=x.T_1 - value(L, slot, recipe._T_1),
+        T_2=x.T_2 - value(L, slot, recipe._T_2),
+        T_b=x.T_b - value(L, slot, recipe._T_b),
+        r_ref=measured.r_ref,
+        r_ref_5mm=measured.r_ref_5mm,
+        r_ref_25mm=measured.r_ref_25mm,
+        T_1_ref=recipe_error(L, slot.episode) + drift(t, slot.episode),
+        v_p=measured.v_p,
+        Q_H=measured.Q_H,
+        v_p_mean=measured.v_p_mean,
+        alpha_ref=measured.alpha_ref,
+        L=L,
+        v_p_ref=measured.v_p_ref,
+        Q_H_ref=measured.Q_H_ref,
+        M_s=x.M_s - value(L, slot, recipe._M_s),
+        dT_i=slot.dT_i,
+        Q_d=slot.Q_d,
+        ring_offset=bias_offset(t, slot.episode),
+        lam=p.lam,
+    )
+
+
+class Logged(NamedTuple):
+    """The entries of a step's ``info``, in SI units."""
+
+    r_c: Annotated[Any, Channel("m", 1.0, "true crystal radius")]
+    r_br: Annotated[Any, Channel("m", 1.0, "true radius of the bright ring")]
+    r_ref: Annotated[Any, Channel("m", 1.0, "radius reference at this length")]
+    L: Annotated[Any, Channel("m", 1.0, "length grown since the crown began")]
+    h_c: Annotated[Any, Channel("m", 1.0, "true meniscus height")]
+    h_ref: Annotated[Any, Channel("m", 1.0, "meniscus height of the recipe")]
+    alpha_c: Annotated[Any, Channel("rad", 1.0, "cone angle of the crystal's wall")]
+    v_g: Annotated[Any, Channel("m/s", 1.0, "growth rate")]
+    v_p: Annotated[Any, Channel("m/s", 1.0, "applied pull speed relative to the melt's surface")]
+    v_p_ref: Annotated[Any, Channel("m/s", 1.0, "pull speed of the recipe")]
+    Q_H: Annotated[Any, Channel("W", 1.0, "applied heater power")]
+    Q_H_ref: Annotated[Any, Channel("W", 1.0, "heater power of the recipe")]
+    v_p_mean: Annotated[Any, Channel("m/s", 1.0, "exponential 30 min mean of v_p - v_p_ref")]
+    T_1: Annotated[Any, Channel("K", 1.0, "true heater temperature")]
+    T_1_ref: Annotated[Any, Channel("K", 1.0, "recipe of the heater temperature, as it is given")]
+    T_b: Annotated[Any, Channel("K", 1.0, "true melt temperature")]
+    M_s: Annotated[Any, Channel("kg", 1.0, "true mass of the crystal, its neck included")]
+    weight: Annotated[Any, Channel("N", 1.0, "weight on the load cell")]
+    H: Annotated[Any, Channel("m", 1.0, "depth of the melt in the crucible, which the lift follows")]
+    v_over_G: Annotated[Any, Channel("1", 1.0, "v/G, growth rate by temperature gradient, relative to the recipe's")]
+    dopant: Annotated[Any, Channel("1", 1.0, "dopant that the crystal takes up, relative to its first part's")]
+    r_br_measured: Annotated[Any, Channel("m", 1.0, "the camera's reading, with noise and offset")]
+    ring_offset: Annotated[Any, Channel("m", 1.0, "offset of the ring that no sensor shows")]
+    term_radius: Annotated[Any, Channel("1", 1.0, "the reward's term of the radius error")]
+    term_pull: Annotated[Any, Channel("1", 1.0, "the reward's term of the mean pull speed")]
+    term_pull_step: Annotated[Any, Channel("1", 1.0, "the reward's term of the step of the pull speed")]
+    term_heater_step: Annotated[Any, Channel("1", 1.0, "the reward's term of the step of the heater power")]
+    cost: Annotated[Any, Channel("1", 1.0, "1 if |r_c - r_ref| > 0.5 mm or v_p_mean is more than 3 % of v_0, else 0")]
+    stage: Annotated[Any, Channel("1", 1.0, "0 crown, 1 body, 2 tail, by the length")]
+    succeeded: Annotated[Any, Channel("bool", 1.0, "whether the length was reached")]
+    action_clipped: Annotated[Any, Channel("bool", 1.0, "whether the action lay outside its box")]
+
+
+@jittable
+def out_of_tolerance(slot: Any, measured: Any) -> Any:
+    """The constraint's cost of a step: 1 if the crystal leaves its quality, else 0."""
+    error = slot.x.r_c - slot.puller.r_0 - measured.r_ref
+    return outside(error, slot.v_p_mean / slot.puller.v_0)
+
+
+@jittable
+def succeeded(slot: Any) -> Any:
+    """1 once the length was reached, else 0."""
+    return 1.0 if slot.over == DONE else 0.0
+
+
+@jittable
+def part_at(L: Any, p: Any) -> Any:
+    """0 in the crown, 1 in the body, 2 in the tail."""
+    if p.crown_length > L:
+        return 0.0
+    return 1.0 if p.crown_length + p.body_length >= L else 2.0
+
+
+@jittable
+def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, at: Any) -> Any:
+    """:class:`Logged` of a slot at its sample's time t [s]; ``ring`` [m] is the true bright ring."""
+    p, x, L = slot.puller, slot.x, slot.x.L
+    now, Phi_s = shape_at(L, p, slot.episode), value(L, slot, recipe._Phi_s)
+    left = (p.M_0 - x.M_s) / p.M_0
+    return Logged(
+        r_c=x.r_c,
+        r_br=ring,
+        r_ref=p.r_0 + measured.r_ref,
+        L=L,
+        h_c=x.h_c,
+        h_ref=value(L, slot, recipe._h_c),
+        alpha_c=np.arctan(at.tan_alpha),
+        v_g=at.v_g,
+        v_p=slot.v_p,
+        v_p_ref=slot.v_p_nominal,
+        Q_H=slot.Q_H,
+        Q_H_ref=slot.Q_H_nominal,
+        v_p_mean=slot.v_p_mean,
+        T_1=x.T_1,
+        T_1_ref=p.T_1_0 + measured.T_1_ref,
+        T_b=x.T_b,
+        M_s=x.M_s,
+        weight=weight(x, p),
+        H=at.deep * p.H_ref,
+        v_over_G=(at.v_g / at.Phi_s) / (now.v_g / Phi_s),
+        dopant=x.N / left,
+        r_br_measured=slot.ring,
+        ring_offset=bias_offset(t, slot.episode),
+        term_radius=cost.radius,
+        term_pull=cost.pull,
+        term_pull_step=cost.pull_step,
+        term_heater_step=cost.heater_step,
+        cost=out_of_tolerance(slot, measured),
+        stage=part_at(L, p),
+        succeeded=succeeded(slot),
+        action_clipped=slot.clipped,
+    )
+
+
+class Lean(NamedTuple):
+    """The entries of ``info="lean"``."""
+
+    r_c: Any
+    r_ref: Any
+    cost: Any
+    succeeded: Any
+
+
+PAST = (
+    Past("ring_error", 0.2 * MM),
+    Past("v_p", 0.2 * PULL_SCALE),
+    Past("T_1", 0.5),
+    Past("Q_H", 0.5 * KILO),
+)
+"""Signals whose past "history" shows."""
+RELATIVE = (
+    Relative("r_ref_5mm", "r_ref", 2.0 * MM, "change of the radius reference within 5 mm"),
+    Relative("r_ref_25mm", "r_ref", 10.0 * MM, "change of the radius reference within 25 mm"),
+    Relative("T_1_ref_5mm", "T_1_ref", 2.0, "change of the recipe within 5 mm"),
+    Relative("T_1_ref_25mm", "T_1_ref", 5.0, "change of the recipe within 25 mm"),
+    Relative("T_1", "T_1_ref", 2.0, "pyrometer reading minus recipe"),
+)
+"""The signals that "history" shows relative to another one."""

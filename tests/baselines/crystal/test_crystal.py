@@ -1,0 +1,61 @@
+"""Controllers of a whole crystal: what the crown does to each, what they refuse, and that their models are right."""
+
+import numpy as np
+import pytest
+
+from cz_gym.baselines.crystal.lqg import STATES, Noise, Weights, design
+from cz_gym.baselines.registry import CRYSTAL_CONTROLLERS, make_controller
+from cz_gym.config import make_config
+from cz_gym.crystal.process import CRYSTAL
+from cz_gym.errors import CzError
+from cz_gym.evaluation.crystal_metrics import crystal_metrics
+from cz_gym.evaluation.protocol import TRAINING_SEEDS, Row
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.physics.meniscus import HURLE
+
+CROWN = Row("crown", "randomized", "a crown", process=CRYSTAL, stage="crown")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "least", "most", "error"),
+    [
+        ("ring-pid", 0, 0, 8.0),
+        ("ring-pid-reduced", 9, 12, 8.0),
+        ("compensated", 10, 12, 6.0),
+        ("lqg-along", 11, 12, 5.0),
+        ("true-radius", 12, 12, 1.0),
+    ],
+)
+def test_twelve_crowns(name, least, most, error):
+    """The ring freezes a PID with the body's gains; who knows the meniscus grows nearly all."""
+    (contender,) = (each for each in CRYSTAL_CONTROLLERS if each.name == name)
+    config = CROWN.config(contender.observation)
+    found = crystal_metrics(rollout(contender.make(config), config, TRAINING_SEEDS[:12]))
+    assert least <= found.completed.sum() <= most
+    assert np.median(found.crown_max_mm) < error
+    assert (found.completed == np.isnan(found.lost_in)).all()
+
+
+def test_filter_and_regulator_are_stable_at_every_length():
+    at = design(make_config(process=CRYSTAL).parameters, HURLE, 5.0, 0.5, Noise(), Weights())
+    for A, B, C, K, F in zip(*at[1:], strict=True):
+        told = np.eye(STATES) - K @ C
+        loop = np.block([[A, np.zeros((STATES, 2))], [np.zeros((2, STATES + 2))]]) + np.vstack([B, np.eye(2)]) @ F
+        assert max(np.abs(np.linalg.eigvals(part)).max() for part in (told @ A, loop)) < 1.0
+
+
+def test_controllers_are_made_for_one_process():
+    crystal, body = make_config(process=CRYSTAL, observation="measured", action="direct"), make_config("randomized")
+    assert make_controller("compensated", crystal).made_for == crystal.made_for
+    with pytest.raises(CzError, match="unknown controller 'compensated'"):
+        make_controller("compensated", body)
+    with pytest.raises(CzError, match="unknown controller 'paper'; choose from recipe, ring-pid"):
+        make_controller("paper", crystal)
+    with pytest.raises(CzError, match="was made for"):
+        rollout(make_controller("compensated", crystal), body, [0])
+    germanium = make_config(process=CRYSTAL, puller="germanium", observation="measured", action="direct")
+    made = make_controller("lqg-along", germanium)
+    action, _ = made.predict(np.zeros((3, len(CRYSTAL.measured)), np.float32))
+    assert action.shape == (3, 2)
+    assert np.isfinite(action).all()

@@ -1,0 +1,122 @@
+"""The plant of a whole crystal: its limit, its balances, its order, and the meniscus down to the crown's start."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from cz_gym import Parameters, make_puller
+from cz_gym.body import plant as body
+from cz_gym.crystal import plant, recipe
+from cz_gym.crystal.parameters import complete
+from cz_gym.crystal.plant import Disturbance, State, at_interface, rates
+from cz_gym.crystal.process import nominal_recipe
+from cz_gym.crystal.shape import shape_at
+from cz_gym.episodes.record import Episode, Factors
+from cz_gym.episodes.schedule import melt_left
+from cz_gym.machine.puller import DEFAULT
+from cz_gym.physics.arithmetic import rk4
+from cz_gym.physics.meniscus import HURLE, hurle_height, hurle_slope
+from cz_gym.process import Inputs
+from cz_gym.support.units import MM
+from tests.physics.test_young_laplace import solve
+
+DESIGN = complete(Parameters(), DEFAULT)
+EPISODE = Episode()
+
+
+@pytest.mark.parametrize("lam", [0.0, 0.4, 1.0])
+def test_a_crystal_without_end_over_a_charge_without_end_is_the_body(lam, rng):
+    endless = DESIGN._replace(M_0=1e18, m=0.0, beta=0.0)
+    p, q = plant.derive(endless, Factors(lam=lam), HURLE), make_puller(lam=lam)
+    n = 300
+    x = body.State(
+        rng.uniform(0.05, 0.1, n), rng.uniform(0.002, 0.009, n), q.T_1_0 + rng.normal(0, 20, n),
+        q.T_2_0 + rng.normal(0, 10, n), q.T_b_0 + rng.normal(0, 3, n),
+    )  # fmt: skip
+    u = Inputs(rng.uniform(0, 4e-5, n), q.Q_H_0 + rng.uniform(-1e4, 1e4, n))
+    Q_d, dT_i = rng.normal(0, 1000, n), rng.normal(0, 1, n)
+    here = rates(State(*x, 1.0, 1e9, 0.0, 1.0), u, Disturbance(Q_d, dT_i), p, HURLE)
+    there = body.rates(x, u, body.Disturbance(Q_d, dT_i, melt_left(0.0, EPISODE)), q, hurle_slope)
+    for mine, bodys in zip(here, there, strict=False):
+        np.testing.assert_allclose(mine, bodys, rtol=1e-12, atol=1e-12 * np.abs(bodys).max())
+
+
+class Audit(NamedTuple):
+    """The state, and the heat that came from outside less what left."""
+
+    r_c: Any
+    h_c: Any
+    T_1: Any
+    T_2: Any
+    T_b: Any
+    L: Any
+    A_s: Any
+    M_s: Any
+    N: Any
+    gained: Any
+
+
+def audited(x, u, d, p, m):
+    rate = rates(State(*x[:9]), u, d, p, m)
+    Phi_l = at_interface(x, d, p, m.slope).Phi_l
+    surface = p.emission * math.pi * (p.R_cr**2 - x.r_c**2) * (x.T_b**4 - p.T_e**4)
+    gain = u.Q_H - p.G_1a * (x.T_1 - p.T_a) - surface - math.pi * x.r_c**2 * Phi_l + d.Q_d
+    return Audit(*rate, gain)
+
+
+def heat_in(x, p):
+    """Heat in heater, crucible and melt, which counts from its melting point: a crystal takes none away there [J]."""
+    return p.C_1 * x.T_1 + p.C_2 * x.T_2 + p.C_b * (p.M_0 - x.M_s) / p.M_0 * (x.T_b - p.T_m)
+
+
+def test_mass_dopant_and_energy_over_a_whole_crystal():
+    """In open loop, under a load; the heat is audited, the mass a quadrature of its shape, the dopant Scheil's law."""
+    p, table = nominal_recipe(DESIGN, HURLE)
+    x, d = Audit(*map(float, recipe.state_at(0.0, table, p, EPISODE)), 0.0), Disturbance(3.0, 0.01)
+    start, lengths, faces = x, [x.L], [math.pi * x.r_c**2]
+    while x.L < 1.262 and abs(x.r_c - shape_at(x.L, p, EPISODE).r) < 8 * MM:
+        row, share = recipe.place(x.L, p)
+        u = Inputs(recipe.look_up(table, row, share, recipe._v_p), recipe.look_up(table, row, share, recipe._Q_H))
+        before, x = x, rk4(audited, x, u, d, p, 5.0, HURLE)
+        middle = rk4(audited, before, u, d, p, 2.5, HURLE)
+        lengths += [middle.L, x.L]
+        faces += [math.pi * middle.r_c**2, math.pi * x.r_c**2]
+    assert x.L > 0.14
+    grown = heat_in(x, p) - heat_in(start, p)
+    assert abs(grown - x.gained) < 1e-9 * heat_in(x, p)
+    L, face = np.array(lengths), np.array(faces)
+    a, b = np.diff(L)[::2], np.diff(L)[1::2]  # Simpson's rule for unequal halves
+    third = (a + b) / 6.0
+    volume = np.sum(
+        third * ((2 - b / a) * face[:-2:2] + (a + b) ** 2 / (a * b) * face[1::2] + (2 - a / b) * face[2::2])
+    )
+    assert x.M_s - start.M_s == pytest.approx(p.rho_s * volume, rel=1e-9)
+    scheil = start.N * ((p.M_0 - x.M_s) / (p.M_0 - start.M_s)) ** p.k_0
+    assert pytest.approx(scheil, rel=1e-9) == x.N
+    assert at_interface(x, d, p, hurle_slope).deep * p.M_0 + x.M_s == pytest.approx(p.M_0, abs=1.0)
+
+
+def test_rk4_converges_with_the_fourth_order_in_the_crown():
+    p, table = nominal_recipe(DESIGN, HURLE)
+    x, u, d = recipe.state_at(0.02, table, p, EPISODE), Inputs(2.4e-5, 5.6e4), Disturbance(200.0, 0.3)
+    exact = solve_ivp(lambda t, y: rates(State(*y), u, d, p, HURLE), (0, 40), x, "DOP853", rtol=1e-13, atol=1e-15)
+    scale, errors = np.maximum(np.abs(exact.y[:, -1]), 1e-6), []
+    for steps in (4, 8, 16):
+        y = x
+        for _ in range(steps):
+            y = rk4(rates, y, u, d, p, 40.0 / steps, HURLE)
+        errors.append(np.abs((np.array(y) - exact.y[:, -1]) / scale).max())
+    assert 3.8 < math.log2(errors[0] / errors[2]) / 2.0 < 4.6
+    assert errors[1] < 1e-6
+
+
+@pytest.mark.parametrize(("radius", "share"), [(10, 0.042), (20, 0.013), (40, 0.013), (87.5, 0.013)])
+def test_hurles_height_against_the_exact_meniscus(radius, share):
+    """Where the wall is vertical, from the crown's start on."""
+    a, theta = make_puller().a, math.radians(11.0)
+    exact = brentq(lambda h: solve(radius * MM, h).theta.item() - theta, 3 * MM, 7 * MM, xtol=1e-7)
+    assert abs(hurle_height(radius * MM, theta, a) / exact - 1.0) < share + 1e-3
