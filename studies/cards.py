@@ -5,7 +5,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from cz_gym.agents import shipped_seeds
+from cz_gym.agents import shipped_names, shipped_seeds
 from cz_gym.agents.agent_file.contract import Contract, read_agent
 from cz_gym.errors import CzError
 from cz_gym.evaluation.files import read_results
@@ -92,11 +92,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(given: argparse.Namespace) -> None:
     check_writable(given.out.parent)
     results, _ = read_results(given.benchmark, [*(column.metric for column in FIGURES), RETURN])
-    if not all(AGENTS.keys() <= by_name.keys() for by_name in results.values()):
-        raise CzError(f"{given.benchmark}: no results of {', '.join(AGENTS)}")
+    shipped = {name: how for name, how in AGENTS.items() if name in shipped_names()}
+    if not all(shipped.keys() <= by_name.keys() for by_name in results.values()):
+        raise CzError(f"{given.benchmark}: no results of {', '.join(shipped)}")
     cards = {
         name: card(name, of, [read_agent(each)[0] for each in shipped_seeds(name)], results)
-        for name, of in AGENTS.items()
+        for name, of in shipped.items()
     }
     write_files({given.out: "\n".join([ABOUT, *cards.values()]).encode()})
     print(f"wrote {given.out}")
