@@ -210,11 +210,10 @@ def make_config(
         raise CzError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
     given = machine.parameters if parameters is None else parameters
     checked = process.check(process.complete(given, machine, stage), shape)
-    usual = interval * math.ceil(process.duration(checked, shape) / interval)
-    length = positive("horizon", usual if horizon is None else horizon)
+    length = positive("horizon", process.duration(checked, shape, interval) if horizon is None else horizon)
     steps = length / interval
     if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
-        raise CzError(f"horizon {horizon} s must be a whole number of control intervals of {interval:g} s")
+        raise CzError(f"horizon {length:g} s must be a whole number of control intervals of {interval:g} s")
     checked_camera = check_camera(camera_for(checked) if camera is None else camera, checked)
     return Config(
         *(drawn_from, model, observation, action, interval, length, checked, shape, checked_camera),

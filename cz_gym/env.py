@@ -306,7 +306,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
     def _info(self) -> dict[str, Any]:
         if self._everything:
             info = Info(zip(self._names, self._signals, strict=True))
-            info["action_clipped"] = info["action_clipped"] > 0.0
+            info["action_clipped"] = bool(info["action_clipped"] > 0.0)
         else:
             info = Info()
             for name, row in self._lean:

@@ -116,7 +116,7 @@ def no_stages(parameters: Any, machine: Any, stage: Any) -> Any:
     return parameters
 
 
-def three_hours(parameters: Any, meniscus: Any) -> float:
+def three_hours(parameters: Any, meniscus: Any, interval: float) -> float:
     """The usual length of an episode [s]."""
     return 3.0 * HOUR
 
@@ -203,7 +203,7 @@ class Process(NamedTuple):
     apart: tuple[str, ...] = ()
     """Parameters that say what an episode grows; the plant does not depend on them."""
     duration: Function = three_hours
-    """``duration(parameters, meniscus)``: the usual length of an episode [s]."""
+    """``duration(parameters, meniscus, interval)``: the usual length of an episode [s]."""
 
     @property
     def functions(self) -> tuple[Any, ...]:

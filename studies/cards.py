@@ -19,6 +19,7 @@ AGENTS = {
     "gradient": "analytic policy gradients: the cost's gradient through policy and plant; the plant is known",
     "ppo": "proximal policy optimisation from nothing, its actions from the reward; a network that estimates the state "
     "from sensors was fitted to the true state, which the critic saw too, in training only",
+    "ppo-plain": "proximal policy optimisation from nothing, from the reward alone",
     "sac": "soft actor-critic from nothing, from the reward; its critics saw the true state in training",
 }
 """Shipped agents, and how each learned."""

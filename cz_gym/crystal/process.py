@@ -1,5 +1,6 @@
 """The process of ``CzCrystal-v0``: plant, recipe, signals and task of a whole crystal as one value for the engine."""
 
+import math
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -79,8 +80,8 @@ def check(parameters: Any, meniscus: MeniscusModel) -> Any:
     return checked
 
 
-def duration(parameters: Any, meniscus: MeniscusModel) -> float:
-    """The longest stage's time along the recipe, times :data:`SLACK` [s]."""
+def duration(parameters: Any, meniscus: MeniscusModel, interval: float) -> float:
+    """The longest stage's time along the recipe, times :data:`SLACK`, in whole intervals [s]."""
     p, table = nominal_recipe(parameters._replace(**dict.fromkeys(APART, 0.0)), meniscus)
     p = p._replace(begins=parameters.begins)
     longest = 0.0
@@ -88,7 +89,7 @@ def duration(parameters: Any, meniscus: MeniscusModel) -> float:
         if getattr(parameters, name) > 0.0:
             start, stop = task.span(stage, 0.0, table, p)
             longest = max(longest, float(task.time_at(stop, table, p) - task.time_at(start, table, p)))
-    return SLACK * longest
+    return interval * math.ceil(SLACK * longest / interval)
 
 
 @jittable

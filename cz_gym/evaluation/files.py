@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import math
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -105,8 +106,8 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {name: _plain(each) for name, each in value.items()}
     if isinstance(value, Estimate):
-        applies = value.mean == value.mean
-        return value._asdict() if applies else {"mean": None, "ci95": None, "n": value.n}
+        ends = value.ci95 if value.ci95 and all(map(math.isfinite, value.ci95)) else None
+        return {"mean": value.mean if math.isfinite(value.mean) else None, "ci95": ends, "n": value.n}
     return value
 
 
