@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.baselines.policy import Floats
-from cz_gym.body.cost import PULL_MEMORY, beyond_band, coefficients
+from cz_gym.body.cost import beyond_band, coefficients, moved_mean, newest_share
 from cz_gym.body.plant import Inputs, State
 from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.episodes.scenario import Actuators
@@ -177,10 +177,10 @@ _MOVE_CURVATURE = _CURVATURE[2:]
 
 def mean_pull(v_p: Floats, v_0: Floats, interval: float) -> Floats:
     """The mean pull speed after each step, relative to v_0 [-]; v_p [m/s] has shape (N, n), v_0 shape (n,)."""
-    share, relative = -np.expm1(-interval / PULL_MEMORY), v_p / v_0 - 1.0
-    means, mean = np.empty_like(relative), np.zeros(len(v_0))
+    relative, mean = v_p / v_0 - 1.0, np.zeros(len(v_0))
+    means = np.empty_like(relative)
     for k, now in enumerate(relative):
-        mean = means[k] = mean + share * (now - mean)
+        mean = means[k] = moved_mean(mean, now, interval)
     return means
 
 
@@ -191,7 +191,8 @@ def _stages(
     after, slopes = linearised(future, x, u)
     N, n = future.target.shape
     slopes = slopes * (SCALES / SCALES[:STATES, None])
-    share, v_0 = -math.expm1(-float(future.lengths[:, 0].sum()) / PULL_MEMORY), nominal[:, 0] / SCALES[STATES]
+    interval, v_0 = float(future.lengths[:, 0].sum()), nominal[:, 0] / SCALES[STATES]
+    share = newest_share(interval)
     A = np.zeros((N, n, MEAN + 1, MEAN + 1))
     A[:, :, :STATES, :MEAN] = slopes
     A[:, :, STATES:MEAN, STATES:MEAN] = np.eye(INPUTS)
@@ -202,7 +203,7 @@ def _stages(
     upper, lower, up, down = range(4)
     curvature, slope = force / slack, barrier / slack
     Q, q = np.zeros(c.shape), np.zeros(c.shape)
-    beyond = beyond_band(mean_pull(u[:, :, 0], nominal[:, 0], float(future.lengths[:, 0].sum())))
+    beyond = beyond_band(mean_pull(u[:, :, 0], nominal[:, 0], interval))
     Q[:, :, 0], q[:, :, 0] = _CURVATURE[0], _CURVATURE[0] * (x[1:, :, 0] - future.target) / MM
     Q[:, :, STATES:MEAN], q[:, :, STATES:MEAN] = curvature[upper] + curvature[lower], slope[upper] - slope[lower]
     Q[:, :, MEAN], q[:, :, MEAN] = _CURVATURE[1] * (beyond != 0.0), _CURVATURE[1] * beyond

@@ -51,9 +51,15 @@ FAILURE_COST = 1000.0
 
 
 @jittable
-def moved_mean(mean: Any, v_p: Any, interval: Any) -> Any:
-    """The mean pull speed [m/s] after an interval [s] at v_p [m/s]."""
-    return mean + (1.0 - np.exp(-interval / PULL_MEMORY)) * (v_p - mean)
+def newest_share(interval: Any) -> Any:
+    """Share of an interval [s] in the exponential mean at its end [-]."""
+    return 1.0 - np.exp(-interval / PULL_MEMORY)
+
+
+@jittable
+def moved_mean(mean: Any, value: Any, interval: Any) -> Any:
+    """The exponential mean after an interval [s] at this value."""
+    return mean + newest_share(interval) * (value - mean)
 
 
 @jittable

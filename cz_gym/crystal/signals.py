@@ -10,10 +10,11 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from cz_gym.body.cost import outside
+from cz_gym.body.signals import PAST as PAST
 from cz_gym.episodes.schedule import bias_offset, drift
 from cz_gym.jit.compile import jittable
 from cz_gym.physics.meniscus import hurle_slope
-from cz_gym.process import DONE, HEATER_SCALE, PULL_SCALE, Past, Relative, signals
+from cz_gym.process import DONE, HEATER_SCALE, PULL_SCALE, Relative, signals
 from cz_gym.process import Channel as Channel
 from cz_gym.support.units import KILO, MINUTE, MM
 
@@ -271,13 +272,6 @@ class Lean(NamedTuple):
     succeeded: Any
 
 
-PAST = (
-    Past("ring_error", 0.2 * MM),
-    Past("v_p", 0.2 * PULL_SCALE),
-    Past("T_1", 0.5),
-    Past("Q_H", 0.5 * KILO),
-)
-"""Signals whose past "history" shows."""
 RELATIVE = (
     Relative("r_ref_5mm", "r_ref", 2.0 * MM, "change of the radius reference within 5 mm"),
     Relative("r_ref_25mm", "r_ref", 10.0 * MM, "change of the radius reference within 25 mm"),

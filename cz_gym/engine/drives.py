@@ -44,9 +44,9 @@ def drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any, process: 
     e, x = slot.episode, labelled(process.State, slot.x)
     slot.v_p_before, slot.Q_H_before = slot.v_p, slot.Q_H
     slot.clipped = 1.0 if (np.abs(pull) > 1.0 or np.abs(heat) > 1.0) else 0.0
+    nominal = process.nominal(x, slot, interval)
     u = next_inputs(x, Inputs(slot.v_p, slot.Q_H_slewed), Inputs(pull, heat), drives, slot, interval, process)
     slot.v_p, slot.Q_H_slewed, slot.Q_H = u.v_p, u.Q_H, u.Q_H
-    nominal = process.nominal(x, slot, interval)
     slot.v_p_nominal, slot.Q_H_nominal = nominal.v_p, nominal.Q_H
     if e.heater_step > 0.0:
         whole = nominal.Q_H + e.heater_step * np.rint((slot.Q_H_slewed - nominal.Q_H) / e.heater_step)

@@ -1,12 +1,11 @@
 """The metrics of whole crystals, one value an episode, from logged signals of ``CzCrystal-v0``."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.body.cost import PULL_MEMORY, TOLERANCE
+from cz_gym.body.cost import PULL_TOLERANCE, TOLERANCE, moved_mean
 from cz_gym.support.units import HOUR, KILO, MM
 
 from .rollout import Rollout
@@ -60,7 +59,7 @@ def crystal_metrics(run: Rollout) -> CrystalMetrics:
         body_rmse_mm=np.sqrt(_share(np.square(error), body)) / MM,
         body_within_half=_share(error <= TOLERANCE, body),
         tail_max_mm=_most(error, tail) / MM,
-        v_over_G_within_3pct=_share(v_over_G <= 0.03, body),
+        v_over_G_within_3pct=_share(v_over_G <= PULL_TOLERANCE, body),
         v_over_G_within_10pct=_share(v_over_G <= 0.10, body),
         hours=(last + 1) * dt / HOUR,
         kwh_per_kg=np.sum(s.Q_H, axis=0, where=run.alive) * dt / KWH / grown,
@@ -71,9 +70,9 @@ def crystal_metrics(run: Rollout) -> CrystalMetrics:
 
 def _mean(values: Floats, dt: float) -> Floats:
     """Exponential 30 min mean along the steps, from 1 on."""
-    keep, mean, means = math.exp(-dt / PULL_MEMORY), np.ones(values.shape[1]), np.empty_like(values)
+    mean, means = np.ones(values.shape[1]), np.empty_like(values)
     for k, row in enumerate(values):
-        mean = means[k] = keep * mean + (1.0 - keep) * row
+        mean = means[k] = moved_mean(mean, row, dt)
     return means
 
 

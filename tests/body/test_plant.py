@@ -90,6 +90,14 @@ def test_the_crystal_halves_what_a_hotter_heater_does_to_the_melt():
     assert (round(response, 2), round(static(surface), 2)) == (0.37, 0.79)
 
 
+def test_an_hour_with_a_heater_one_kelvin_too_hot_thins_the_crystal_by_nine_millimetres():
+    p = make_puller()
+    x = p.state_0
+    for _ in range(720):
+        x = rk4(x._replace(T_1=p.T_1_0 + 1.0), p.inputs_0, NO_DISTURBANCE, p, 5.0, hurle_slope)
+    assert x.r_c - p.r_0 == pytest.approx(-9.4e-3, abs=0.1e-3)
+
+
 def test_compiled_equations_equal_the_plain_ones(states, rng):
     @kernel
     def loop(rows, u, d, p, out):

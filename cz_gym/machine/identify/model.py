@@ -18,6 +18,7 @@ from scipy.signal import lfilter
 
 from cz_gym.body.plant import Disturbance, Inputs, State, derive_puller, rates, rk4
 from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
+from cz_gym.episodes.log_series import MIX
 from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import kernel
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
@@ -62,7 +63,7 @@ class Lags(NamedTuple):
     """Time constant of the pyrometer's filter [s]."""
 
 
-LAM = 0.5
+LAM = MIX
 """Share of conduction where it is not free, and the mean of its prior [-]."""
 TAU_FAST, TAU_SLOW, TAU_RATE = 30.0, 780.0, 2400.0
 """Correlation times of the interface temperature's fluctuations and of the load's rate [s]."""
