@@ -49,7 +49,7 @@ def set_points(puller: PullerFile) -> Row:
     r, slope, v_g = (np.array(column) for column in zip(*(shape_at(each, p, Episode()) for each in L), strict=True))
     level = (p.M_0 - at.M_s - at.M_men) / (p.rho_l * np.pi * p.R_cr**2)
     columns = Row(
-        L / MM, (at.t - at.t[recipe.MARGIN]) / MINUTE, r / MM, np.degrees(np.arctan(slope)), v_g / MM_PER_MIN,
+        L / MM, (at.t - at.t[recipe.MARGIN]) / MINUTE, r / MM, np.degrees(np.arctan(slope)).round(9) + 0.0, v_g / MM_PER_MIN,
         at.v_p / MM_PER_MIN, at.Q_H / KILO, at.T_1, at.T_b - p.T_m, at.h_c / MM, (r + at.ring) / MM, at.M_s,
         -np.gradient(level, at.t) / MM_PER_MIN,
     )  # fmt: skip
@@ -66,16 +66,16 @@ def to_csv(rows: Row) -> str:
 
 
 def draw(rows: Row, title: str) -> bytes:
-    """Picture of the set points: the crystal to scale, then drives and temperatures, as PNG."""
+    """Picture of the set points: the crystal's outline, then drives and temperatures, as PNG."""
     from cz_gym.evaluation.report.canvas import canvas, png
 
     figure = canvas(8.0, 7.0)
     shape, speed, power, heat = figure.subplots(4, 1, sharex=True, height_ratios=(0.7, 1, 1, 1))
     shape.fill_between(rows.length_mm, -rows.radius_mm, rows.radius_mm, color="0.8")
-    shape.set(ylabel="radius [mm]", title=title, aspect="equal")
+    shape.set(ylabel="radius [mm]", title=title)
     speed.plot(rows.length_mm, rows.growth_rate_mm_per_min, "--", label="growth rate")
     speed.plot(rows.length_mm, rows.pull_speed_mm_per_min, label="pull speed")
-    speed.set(ylabel="[mm/min]")
+    speed.set(ylabel="speed [mm/min]")
     speed.legend(frameon=False, ncols=2)
     power.plot(rows.length_mm, rows.heater_power_kW)
     power.set(ylabel="heater [kW]")
