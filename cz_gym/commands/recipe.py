@@ -49,7 +49,8 @@ def set_points(puller: PullerFile) -> Row:
     r, slope, v_g = (np.array(column) for column in zip(*(shape_at(each, p, Episode()) for each in L), strict=True))
     level = (p.M_0 - at.M_s - at.M_men) / (p.rho_l * np.pi * p.R_cr**2)
     columns = Row(
-        L / MM, (at.t - at.t[recipe.MARGIN]) / MINUTE, r / MM, np.degrees(np.arctan(slope)).round(9) + 0.0, v_g / MM_PER_MIN,
+        L / MM, (at.t - at.t[recipe.MARGIN]) / MINUTE, r / MM,
+        np.degrees(np.arctan(slope)).round(9) + 0.0, v_g / MM_PER_MIN,
         at.v_p / MM_PER_MIN, at.Q_H / KILO, at.T_1, at.T_b - p.T_m, at.h_c / MM, (r + at.ring) / MM, at.M_s,
         -np.gradient(level, at.t) / MM_PER_MIN,
     )  # fmt: skip
