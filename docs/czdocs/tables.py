@@ -25,7 +25,7 @@ from cz_gym.physics.parameters import describe
 from cz_gym.physics.quantities import MACHINE, Quantity
 from cz_gym.support.units import MINUTE
 
-from . import nomenclature
+from . import nomenclature, results
 
 ABSENT = "\N{EN DASH}"
 POWERS = str.maketrans("234", "²³⁴")
@@ -193,6 +193,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "tags": lambda: markdown(("tag", "type", "meaning"), ((code(t.name), t.kind.__name__, t.meaning) for t in TAGS)),
     "puller": puller,
     **{part: partial(symbols, part) for part in nomenclature.ROWS},
+    **results.TABLES,
 }
 """Every table, by the name a page asks for it with."""
 

@@ -1,0 +1,128 @@
+"""Tables that pages take from committed results and from the records of searches."""
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+from cz_gym.baselines.tuning.lqg import FAMILY
+from cz_gym.evaluation.equal_activity import ratios
+from cz_gym.evaluation.report.tables import markdown
+
+ROOT = Path(__file__).parents[2]
+RECORDS = ROOT / "cz_gym" / "machine" / "pullers" / "default"
+SCENARIOS = ("randomized", "hard", "sensor-fault", "puller", "hot-zone")
+OBSERVABLE = ("sensor-fault", "puller")
+"""Scenarios whose true radius error holds an offset of the ring, which no sensor shows."""
+STEP = "pull_step_rms_mm_per_min"
+PIDS = ("paper", "paper-filtered", "paper-tuned", "pid-conventional", "industrial")
+LQGS = ("lqg", "lqg-quiet", "lqg-at-0.02", "lqg-at-0.02-adaptive")
+BOUNDS = ("lqg", "lqg-quiet", "lqg-true", "full-information", "clairvoyant")
+MEMBERS = ("0.005", "0.008", "0.013", "0.02", "0.03")
+"""Frontier of the LQG: largest pull step RMS of each member [mm/min]."""
+METRICS = (
+    ("rmse_observable_mm", "observable RMSE [mm]", "{:.3f}"),
+    (STEP, "pull step RMS [mm/min]", "{:.4f}"),
+    ("mean_pull_within_3pct", "30 min mean pull within 3 % [share]", "{:.2f}"),
+    ("cost", "cost", "{:.4f}"),
+    ("failure_rate", "crystals lost [share]", "{:.3f}"),
+)
+"""Rows of a table of figures: metric, its words, its format."""
+Lines = list[str]
+
+
+@cache
+def run(name: str) -> Any:
+    """A committed run of the benchmark."""
+    return json.loads((ROOT / "results" / name / "benchmark.json").read_text())
+
+
+def figures(name: str, controllers: Sequence[str], scenarios: Sequence[str] = SCENARIOS) -> Lines:
+    """Means of a run: a column a controller, a row a scenario and metric."""
+    rows = []
+    for scenario in scenarios:
+        of = run(name)["results"].get(scenario, {})
+        for metric, words, shown in METRICS:
+            cells = [shown.format(of[each][metric]["mean"]) if each in of else "-" for each in controllers]
+            rows.append((f"{scenario}: {words}", *cells))
+    return table(("", *map(code, controllers)), rows)
+
+
+def gaps() -> Lines:
+    """Optimality gaps of the bounds' run [%]."""
+    rows = []
+    for key, words in (("optimality_gap", "cost"), ("optimality_gap_radius", "squared radius error")):
+        of = run("bounds")[key]
+        for each in ("lqg", "lqg-quiet", "lqg-true", "full-information"):
+            cells = [(of[s][each]["mean"], *of[s][each]["ci95"]) for s in of]
+            rows.append(
+                (f"{words}: {code(each)}", *("{:.2f} [{:.2f}, {:.2f}]".format(*(100 * x for x in c)) for c in cells))
+            )
+    return table(("gap [%]", *of), rows)
+
+
+def equal() -> Lines:
+    """Radius errors over the LQG's at equal pull steps, in the frontier's run."""
+    of, columns = run("frontier")["results"], []
+    for scenario in of:
+        metric = "rmse_observable_mm" if scenario in OBSERVABLE else "rmse_mm"
+        points = {name: (means[STEP]["mean"], means[metric]["mean"]) for name, means in of[scenario].items()}
+        columns.append(ratios(points, FAMILY))
+    names = [name for name in of[SCENARIOS[0]] if name not in FAMILY]
+    rows = ((code(name), *(f"{each[name]:.3f}" if name in each else "-" for each in columns)) for name in names)
+    return table(("", *(f"{each}, observable" if each in OBSERVABLE else each for each in of)), rows)
+
+
+def frontier() -> Lines:
+    """Figures with which the frontier's members were chosen, on validation crystals."""
+    rows = []
+    for scenario in SCENARIOS[:-1]:
+        own = "" if scenario == "randomized" else f"-{scenario}"
+        chosen = [record(f"lqg-at-{size}{own}")["chosen"]["figures"] for size in MEMBERS]
+        for metric, words, shown in (
+            ("pull_step", "pull step RMS [mm/min]", "{:.4f}"),
+            ("rmse_mm", "RMSE [mm]", "{:.3f}"),
+        ):
+            rows.append((f"{scenario}: {words}", *(shown.format(each[metric]) for each in chosen)))
+    return table(("", *(code(f"lqg-at-{size}") for size in MEMBERS)), rows)
+
+
+def searches(prefix: str) -> Lines:
+    """Budgets of the searches whose records ship: candidates and training crystals."""
+    rows: dict[tuple[str, str, str], list[str]] = {}
+    for path in sorted(RECORDS.glob(f"{prefix}*.json")):
+        found = record(path.stem)
+        budget = (found["scenario"], str(found["budget"]["trials"]), str(found["budget"]["episodes"]))
+        rows.setdefault(budget, []).append(code(found["controller"]))
+    lines = ((", ".join(names), *budget) for budget, names in sorted(rows.items()))
+    return table(("searches", "crystals of", "candidates", "training crystals"), lines)
+
+
+def record(name: str) -> Any:
+    """The record of a shipped search."""
+    return json.loads((RECORDS / f"{name}.json").read_text())
+
+
+def code(text: str) -> str:
+    """The text as code."""
+    return f"`{text}`"
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> Lines:
+    """A table of numbers as a page holds it."""
+    return [*markdown(tuple(head), [tuple(row) for row in rows]).splitlines(), ""]
+
+
+TABLES: dict[str, Callable[[], Lines]] = {
+    "figures-pid": partial(figures, "benchmark", PIDS),
+    "figures-lqg": partial(figures, "benchmark", LQGS),
+    "figures-bounds": partial(figures, "bounds", BOUNDS, SCENARIOS[:-1]),
+    "figures-mpc": partial(figures, "bounds", ("lqg", "lqg-quiet", "ekf-mpc"), SCENARIOS[:-1]),
+    "gaps": gaps,
+    "ratios": equal,
+    "frontier": frontier,
+    "searches-lqg": partial(searches, "lqg"),
+    "searches-pid": partial(searches, "[!l]"),
+}
+"""Every table, by the name a page asks for it with."""
