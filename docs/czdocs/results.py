@@ -99,6 +99,29 @@ def searches(prefix: str) -> Lines:
     return table(("searches", "crystals of", "candidates", "training crystals"), lines)
 
 
+def rows_of(path: str) -> list[list[str]]:
+    """The rows of a committed table, its headings first."""
+    lines = [line for line in (ROOT / "results" / path).read_text().splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if not line.startswith("|-")]
+
+
+def copied(path: str) -> Lines:
+    """A committed table as it stands."""
+    head, *rows = rows_of(path)
+    return table(head, rows)
+
+
+def faults() -> Lines:
+    """Radius error and lost crystals of each block under each fault."""
+    cells: dict[str, list[str]] = {}
+    controllers = dict[str, None]()
+    for controller, _, fault, error, _, lost, _ in rows_of("faults/report.md")[1:]:
+        controllers[controller] = None
+        cells.setdefault(fault, []).extend((error, lost))
+    head = [each for name in controllers for each in (f"{code(name)} [mm]", "lost")]
+    return table(("fault", *head), ((fault, *row) for fault, row in cells.items()))
+
+
 def record(name: str) -> Any:
     """The record of a shipped search."""
     return json.loads((RECORDS / f"{name}.json").read_text())
@@ -119,7 +142,9 @@ TABLES: dict[str, Callable[[], Lines]] = {
     "figures-lqg": partial(figures, "benchmark", LQGS),
     "figures-bounds": partial(figures, "bounds", BOUNDS, SCENARIOS[:-1]),
     "figures-mpc": partial(figures, "bounds", ("lqg", "lqg-quiet", "ekf-mpc"), SCENARIOS[:-1]),
+    "faults": faults,
     "gaps": gaps,
+    "machines": partial(copied, "other_machine/machines.txt"),
     "ratios": equal,
     "frontier": frontier,
     "searches-lqg": partial(searches, "lqg"),
