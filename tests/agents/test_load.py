@@ -7,7 +7,7 @@ from cz_gym import agents
 from cz_gym.agents.agent_file.contract import read_agent
 from cz_gym.config import make_config
 
-SHIPPED = {"gradient": 5, "ppo": 3}
+SHIPPED = {"gradient": 10, "ppo": 3}
 """Training seeds of each name."""
 
 
