@@ -67,12 +67,13 @@ test-wheel: $(TEST_READY) ## the tests on what the wheel installs, outside this 
 	"$(CURDIR)/$(BIN)/python" -m pytest -q $(TESTS) $(IN_PARALLEL)
 
 ADVISORIES := https://pypi.org/pypi/numpy/$(shell sed -n 's/^numpy==//p' constraints.txt)/json
-audit: ## known weaknesses of the pinned packages; asks PyPI's advisories
+audit: ## known weaknesses of the pinned and of the lowest packages; asks PyPI's advisories
 	@$(PYTHON) -c 'import json, urllib.request as web; json.load(web.urlopen("$(ADVISORIES)"))["vulnerabilities"]' \
 	2>/dev/null || { echo "audit: nothing was audited: PyPI's advisories cannot be read ($(ADVISORIES))" >&2; exit 2; }
 	$(PYTHON) -m venv build/audit
 	build/audit/bin/python -m pip install --quiet pip-audit
-	build/audit/bin/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict
+	for pins in constraints.txt constraints-lowest.txt; do \
+	build/audit/bin/pip-audit --requirement $$pins --no-deps --disable-pip --strict || exit 1; done
 
 lock: $(TEST_READY) ## pylock.toml: the pinned versions for Linux with their hashes; asks PyPI
 	$(BIN)/uv pip compile pyproject.toml --extra test --constraint constraints.txt --python-platform linux --quiet \
