@@ -128,13 +128,13 @@ class PPO(Reinforcement):
 
     name: str = "ppo"
     hidden: tuple[int, ...] = (32, 32)
-    steps: int = 48_000_000
+    steps: int = 64_000_000
     num_envs: int = 2048
     """Many crystals at a time: what an action changes is small beside what the disturbances do."""
     action_repeat: int = 4
-    n_steps: int = 64
+    n_steps: int = 32
     fewest_updates: int = 90
-    batch_size: int = 4096
+    batch_size: int = 2048
     n_epochs: int = 5
     learning_rate: float = 1e-3
     gae_lambda: float = 0.9
