@@ -42,8 +42,6 @@ class Step(NamedTuple):
     grows: npt.NDArray[np.bool_]
     """Whether the crystal grew, shape (n,). One that is lost or whose episode is over stays as it is; its cost and its
     derivatives are 0."""
-    lost: npt.NDArray[np.bool_]
-    """Whether the crystal is lost, shape (n,); false for one that has reached its length."""
     jacobian: Floats
     """Derivatives of the next state and of the cost's terms, shape (n, 14, 12): rows are state and cost, columns the
     state before and the two actions."""
@@ -149,8 +147,7 @@ class DifferentiableBatch:
         info = out.info[:, :n]
         cost = np.where(self.grows, info[self._costs], 0.0).T
         value, reference, offset = info[self._errors]
-        lost = slots["over"] == LOST
-        return Step(self._state, out.observation, cost, value - reference, offset, self.grows, lost, jacobian)
+        return Step(self._state, out.observation, cost, value - reference, offset, self.grows, jacobian)
 
     def _copied(self) -> Out:
         """A copy of the last step's results in new arrays."""
@@ -171,6 +168,12 @@ class DifferentiableBatch:
         state = np.empty((self.num_envs, len(self._names)))
         self._gather(self._batch.memory, state, 0, self.num_envs)
         return state
+
+    @property
+    def lost(self) -> npt.NDArray[np.bool_]:
+        """Whether each crystal is lost, shape (n,): one that has reached its length does not grow on either."""
+        lost: npt.NDArray[np.bool_] = ~self.grows & (self._batch.memory.slots["over"] == LOST)
+        return lost
 
     @property
     def scenarios(self) -> npt.NDArray[Any]:

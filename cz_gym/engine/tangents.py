@@ -209,8 +209,10 @@ def _nominal_of(numbers: Any, i: Any, slot: Any, model: Any) -> Any:
 def _shown_by(by_state: Any, slot: Any, t: Any, per_scale: Any, model: Any) -> None:
     """Derivatives of the "measured" channels by the differentiable state; the pyrometer's reading is of now."""
     process, by, seen_by = model.process, scratch(model.channels, model.shown_by), scratch(4, model.states)
-    x, extra, nominal = labelled(process.State, slot.x), labelled(process.Extra, slot), Inputs(
-        slot.v_p_nominal, slot.Q_H_nominal
+    x, extra, nominal = (
+        labelled(process.State, slot.x),
+        labelled(process.Extra, slot),
+        Inputs(slot.v_p_nominal, slot.Q_H_nominal),
     )
     at = x, labelled(Inputs, slot), nominal, extra, labelled(Readings, slot)
     derivatives(process.Measured, process.measure, at, (slot, t), by)
@@ -231,12 +233,13 @@ def _shown_by(by_state: Any, slot: Any, t: Any, per_scale: Any, model: Any) -> N
 def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, Any, Any]:
     """Compile the loops for a process on a meniscus model.
 
-    ``gather(memory, state, start, stop)`` writes the differentiable states. ``shown(memory, per_scale, interval,
-    by_state, start, stop)`` writes the derivatives of "measured" by them, shape (n, channels, states). ``tangents(memory, state, held,
-    actions, grows, clock, drives, work, jacobian, start, stop)`` writes the derivatives of the step that led from
-    ``state`` to where the slots are now, shape (n, rows, states + actions); zero for a slot that does not grow.
-    ``held``, shape (n, 2), is Q_d [W] and dT_i [K] before the step, which may be 5 s long: those of its first substep
-    if a point of the grid lies inside.
+    ``gather(memory, state, start, stop)`` writes the differentiable states.
+    ``shown(memory, per_scale, interval, by_state, start, stop)`` writes the derivatives of "measured" by them, shape
+    (n, channels, states).
+    ``tangents(memory, state, held, actions, grows, clock, drives, work, jacobian, start, stop)`` writes the derivatives
+    of the step that led from ``state`` to where the slots are now, shape (n, rows, states + actions); zero for a slot
+    that does not grow. ``held``, shape (n, 2), is Q_d [W] and dT_i [K] before the step, which may be 5 s long: those of
+    its first substep if a point of the grid lies inside.
     """
     model, m = model_of(process, meniscus), meniscus
 

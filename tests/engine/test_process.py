@@ -142,7 +142,7 @@ TANK = Process(
     logged=logged, lean=jittable(lambda slot, seen: Lean(slot.x.h, slot.puller.h_0 + seen.h_ref)), charged=charged,
     cost_terms=cost_terms, cost_slopes=cost_slopes, reward=reward, Extra=Extra,
     points=lambda p: [(Level(0.9 * p.h_0, p.T_0 + 5.0), Inputs(p.v_0, 100.0), Load(3.0))],
-    weights=WEIGHTS, carry=jittable(lambda extra, u, about, interval: Extra(extra.fed + u.v_p * interval)), table=(3, 2),
+    weights=WEIGHTS, carry=jittable(lambda extra, u, about, dt: Extra(extra.fed + u.v_p * dt)), table=(3, 2),
 )  # fmt: skip
 # The end of the process.
 
