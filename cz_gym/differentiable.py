@@ -95,7 +95,8 @@ class DifferentiableBatch:
         self._shows = BufferPool((self.num_envs if self._moves else 1, *shows), np.float64)
         self.measured_by_state: Floats = np.zeros(shows)
         """Derivatives of the last "measured" observation by the last state, shape (12, 10), the same for all slots and
-        steps; (n, 17, 17) on CzCrystal-v0, where references run with the length. Zero before the first reset."""
+        steps; (n, 17, 17) on CzCrystal-v0, where references run with the length. Zero before the first reset, and for a
+        crystal that is lost."""
 
     def reset(self, seeds: Sequence[int], which: Sequence[int] | None = None) -> tuple[Floats, npt.NDArray[np.float32]]:
         """Draw the episodes of these seeds, one for each of the slots ``which``, by default all; the others stay.
@@ -162,6 +163,7 @@ class DifferentiableBatch:
         if self._moves or first:
             shown, batch = self._shows.new(), self._batch
             self._shown(batch.memory, batch.scales.measured, batch.clock.interval, shown, 0, len(shown))
+            shown[~self.grows[: len(shown)]] = 0.0  # those of a lost crystal may be infinite
             self.measured_by_state = shown if self._moves else shown[0]
 
     def _now(self) -> Floats:
