@@ -201,6 +201,19 @@ def test_the_chain_rule_over_rk4_is_exact():
         x = rk4(x, u, d, puller, 5.0, hurle_slope)
 
 
+def test_the_end_of_the_tail_has_derivatives():
+    """Where the crystal is hundreds of its fin's lengths long; and a length that is reached is no loss."""
+    batch = DifferentiableBatch(make_config("nominal", process=CRYSTAL, stage=1.24, **PLAIN), 2)
+    batch.reset(range(2))
+    for _ in range(600):
+        step = batch.step(np.zeros((2, 2)))
+        assert np.isfinite(step.jacobian).all()
+        assert np.isfinite(batch.measured_by_state).all()
+    assert not step.grows.any()
+    assert not batch.lost.any()
+    assert not batch.measured_by_state.any()
+
+
 DEAD = replace(RANDOMIZED, actuators=Actuators(heater_dead_time=(0.0, 5.0)))
 
 
