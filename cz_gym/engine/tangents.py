@@ -230,7 +230,7 @@ def _shown_by(by_state: Any, slot: Any, t: Any, per_scale: Any, model: Any) -> N
 
 
 @lru_cache(maxsize=8)
-def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, Any, Any]:
+def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, ...]:
     """Compile the loops for a process on a meniscus model.
 
     ``gather(memory, state, start, stop)`` writes the differentiable states.
@@ -317,5 +317,5 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, Any,
                 J[reading, reading] = 1.0
 
     keep = hashed(*process.functions, *meniscus.functions)
-    gather, shown, tangents = (kernel(loop, keep, allocates=False) for loop in (gather, shown, tangents))
-    return gather, shown, tangents
+    compiled: Any = (kernel(loop, keep, allocates=False) for loop in (gather, shown, tangents))
+    return tuple(compiled)
