@@ -7,8 +7,9 @@ observations of the environment as it is. Needs stable-baselines3.
 """
 
 from collections.abc import Sequence
+from functools import cache
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,36 +21,52 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 from torch.nn.functional import huber_loss
 
-from cz_gym.body.signals import MEASURED, STATE, Channel, Measured
+from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.errors import CzError
-from cz_gym.observation import HISTORY
+from cz_gym.observation import observations
+from cz_gym.process import Channel
 from cz_gym.support.names import needs
 
-PRESENT = len(MEASURED) + 1
-"""Number of channels of "history" that show the present; the last one is the integral of the ring error."""
 GAINS = {
     "ring_error": 8.0, "integral": 4.0, "v_p": 8.0, "Q_H": 8.0, "r_c_error": 8.0, "h_c": 8.0, "T_b": 8.0, "dT_i": 2.0,
     "ring_offset": 8.0, "lam": 4.0, "v_p_mean": 2.0,
 }  # fmt: skip
 """Factors that bring channels that vary little while a crystal is held to the order of 1; the others need none."""
-UNKNOWN = [i for i, each in enumerate(STATE) if each.name not in Measured._fields or each.name == "T_1"]
-"""Places in the true state of what no sensor shows without error."""
+
+
+class Layout(NamedTuple):
+    """The channels that an asymmetric policy is given."""
+
+    history: tuple[Channel, ...]
+    state: tuple[Channel, ...]
+    present: int
+    """Number of channels of "history" that show the present; the last one is the integral of the ring error."""
+    unknown: list[int]
+    """Places in the true state of what no sensor shows without error."""
+
+
+@cache
+def layout(width: int) -> Layout:
+    """The layout of that many channels: of "history" and the true state of the environment that has so many of both."""
+    for process in ENVIRONMENTS.values():
+        history, state = observations(process)["history"], process.state
+        if width == len(history) + len(state):
+            unknown = [i for i, each in enumerate(state) if each not in process.measured]
+            return Layout(history, state, len(process.measured) + 1, unknown)
+    raise CzError("this policy is told the true state: make_vec_env(..., critic_state=True)")
 
 
 class Asymmetric(BasePolicy):
     """A policy whose critic reads the plant's true state behind the channels of "history"."""
 
-    channels = len(HISTORY)
-    """Number of channels that the actor reads."""
-
     def __init__(self, observation_space: Any, *others: Any, **named: Any) -> None:
-        if observation_space.shape != (len(HISTORY) + len(STATE),):
-            raise CzError("this policy is told the true state: make_vec_env(..., critic_state=True)")
+        self.channels = len(layout(observation_space.shape[-1]).history)
+        """Number of channels that the actor reads."""
         super().__init__(observation_space, *others, **named)
 
     def predict(self, observation: Any, *others: Any, **named: Any) -> Any:
         """As stable-baselines3's; the true state may be missing from the observation."""
-        missing = self.channels + len(STATE) - observation.shape[-1]
+        missing = self.observation_space.shape[0] - observation.shape[-1]
         padding = ((0, 0),) * (observation.ndim - 1) + ((0, missing),)
         return super().predict(np.pad(observation, padding), *others, **named)
 
@@ -93,7 +110,7 @@ class StateCritic(ContinuousCritic):
     def __init__(self, *others: Any, **named: Any) -> None:
         super().__init__(*others, **named)
         sight, actions = self.features_extractor, get_action_dim(self.action_space)
-        width = sight.features_dim + actions * (len(STATE) + 1 + actions)
+        width = sight.features_dim + actions * (len(sight.layout.state) + 1 + actions)
         sizes = [width, *named["net_arch"]]
         for place in range(self.n_critics):
             layers = [nn.Sequential(nn.Linear(a, b), nn.LayerNorm(b), nn.SiLU()) for a, b in pairwise(sizes)]
@@ -124,20 +141,22 @@ class StateEstimator(BaseFeaturesExtractor):
     state_gains: torch.Tensor
 
     def __init__(self, space: Any) -> None:
-        super().__init__(space, PRESENT + len(UNKNOWN))
-        self.register_buffer("gains", _gains(HISTORY), persistent=False)
-        self.register_buffer("state_gains", _gains(STATE)[UNKNOWN], persistent=False)
-        self.estimate = nn.Sequential(*create_mlp(len(HISTORY), len(UNKNOWN), [128, 128]))
+        known = layout(space.shape[0])
+        super().__init__(space, known.present + len(known.unknown))
+        self.layout, self.channels = known, len(known.history)
+        self.register_buffer("gains", _gains(known.history), persistent=False)
+        self.register_buffer("state_gains", _gains(known.state)[known.unknown], persistent=False)
+        self.estimate = nn.Sequential(*create_mlp(self.channels, len(known.unknown), [128, 128]))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Shape (n, at least the channels of "history") to (n, features)."""
-        seen = observations[:, : len(HISTORY)] * self.gains
-        return torch.cat([seen[:, :PRESENT], self.estimate(seen).detach()], dim=1)
+        seen = observations[:, : self.channels] * self.gains
+        return torch.cat([seen[:, : self.layout.present], self.estimate(seen).detach()], dim=1)
 
     def loss(self, observations: torch.Tensor) -> torch.Tensor:
         """Huber's loss of the estimate; the true state follows the channels of "history"."""
-        seen, state = observations[:, : len(HISTORY)], observations[:, len(HISTORY) :]
-        return huber_loss(self.estimate(seen * self.gains), state[:, UNKNOWN] * self.state_gains)
+        seen, state = observations[:, : self.channels], observations[:, self.channels :]
+        return huber_loss(self.estimate(seen * self.gains), state[:, self.layout.unknown] * self.state_gains)
 
 
 class StateSight(BaseFeaturesExtractor):
@@ -150,14 +169,16 @@ class StateSight(BaseFeaturesExtractor):
     pairs: torch.Tensor
 
     def __init__(self, space: Any) -> None:
-        pairs = torch.triu_indices(len(STATE), len(STATE))
-        super().__init__(space, len(HISTORY) + len(STATE) + pairs.shape[1])
-        self.register_buffer("gains", _gains([*HISTORY, *STATE]), persistent=False)
+        known = layout(space.shape[0])
+        pairs = torch.triu_indices(len(known.state), len(known.state))
+        super().__init__(space, space.shape[0] + pairs.shape[1])
+        self.layout = known
+        self.register_buffer("gains", _gains([*known.history, *known.state]), persistent=False)
         self.register_buffer("pairs", pairs, persistent=False)
 
     def state(self, observations: torch.Tensor) -> torch.Tensor:
         """The true state within +-4, shape (n, channels of the state)."""
-        return (observations * self.gains)[:, len(HISTORY) :].clamp(-4.0, 4.0)
+        return (observations * self.gains)[:, len(self.layout.history) :].clamp(-4.0, 4.0)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Shape (n, channels of "history" and of the state) to (n, features)."""

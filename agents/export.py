@@ -21,7 +21,7 @@ from cz_gym.agents.asymmetric import Asymmetric
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.config import Config
 from cz_gym.evaluation.contender import PLANT, REWARD, STATE
-from cz_gym.observation import OBSERVATIONS
+from cz_gym.observation import observations
 from cz_gym.sb3 import environment_steps
 
 OPSET, IR_VERSION = 17, 9
@@ -133,7 +133,7 @@ def to_agent(
 ) -> OnnxPolicy:
     """The algorithm's policy as an agent called ``name``, not validated yet; ``path`` names it in errors."""
     policy = algorithm.policy
-    content = to_onnx(policy, len(OBSERVATIONS[config.observation]), normalisation)
+    content = to_onnx(policy, len(observations(config.process)[config.observation]), normalisation)
     contract = make_contract(
         content,
         **facts_of(config),

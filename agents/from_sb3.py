@@ -24,7 +24,7 @@ from cz_gym.config import Config, check_config, make_config
 from cz_gym.env import CzEnv, observation_space
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.user_code import scenarios
-from cz_gym.observation import DRIVE_CHANNELS, OBSERVATIONS
+from cz_gym.observation import observations
 from cz_gym.support.atomic_files import write_files
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.names import needs
@@ -87,7 +87,7 @@ def save_agent(
     normalisation, config = normalisation or model.get_vec_normalize_env(), _config_of(model, config)
     _check_wrappers(model)
     _check_spaces(model, config)
-    _check_normalisation(model, normalisation, config.observation)
+    _check_normalisation(model, normalisation, config)
     agent = to_agent(model, name, int((model.seed if seed is None else seed) or 0), config, normalisation, path)
     apart = disagreement(agent, model, normalisation, config)
     if not apart <= TOLERANCE:
@@ -126,7 +126,7 @@ def _config_of(model: BaseAlgorithm, given: Config | None = None) -> Config:
     except AttributeError:
         if given is None:
             raise AgentFileError(
-                "the model is in no environment of Cz-v0: say in which it was trained (config)"
+                "the model is in no environment of Cz-v0 or CzCrystal-v0: say in which it was trained (config)"
             ) from None
         return given
     config = given or configs[0]
@@ -173,7 +173,7 @@ def _check_spaces(model: BaseAlgorithm, config: Config) -> None:
     """AgentFileError unless the model reads and acts as the environment of these settings wants."""
     from cz_gym.agents.asymmetric import Asymmetric
 
-    wanted = (len(OBSERVATIONS.get(config.observation, ())),), (len(DRIVE_CHANNELS),)
+    wanted = (len(observations(config.process).get(config.observation, ())),), (2,)
     shapes = model.observation_space.shape, model.action_space.shape
     if isinstance(model.policy, Asymmetric):
         shapes = (model.policy.channels,), shapes[1]
@@ -184,7 +184,7 @@ def _check_spaces(model: BaseAlgorithm, config: Config) -> None:
         )
 
 
-def _check_normalisation(model: BaseAlgorithm, normalisation: VecNormalize | None, observation: str) -> None:
+def _check_normalisation(model: BaseAlgorithm, normalisation: VecNormalize | None, config: Config) -> None:
     """AgentFileError if the model was trained on normalised observations, and their normalisation is missing.
 
     A saved model keeps its last observation: there the camera's flag is 0 or 1 unless it is normalised. A model that is
@@ -194,9 +194,9 @@ def _check_normalisation(model: BaseAlgorithm, normalisation: VecNormalize | Non
 
     if normalisation is not None:
         return
-    names = [channel.name for channel in OBSERVATIONS[observation]]
+    names = [channel.name for channel in observations(config.process)[config.observation]]
     seen, before = model._last_obs, model._last_original_obs
-    space = observation_space(observation)
+    space = observation_space(config.observation, config.process)
     plain = before is None and (model.observation_space == space or isinstance(model.policy, Asymmetric))
     if isinstance(seen, np.ndarray) and VALID in names:
         plain = bool(np.isin(seen[:, names.index(VALID)], (0.0, 1.0)).all())

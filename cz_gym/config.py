@@ -133,7 +133,9 @@ class Config:
     def reward_hash(self) -> str:
         """SHA-256 of the reward: its weights, and what it computes at some points (16 hex digits)."""
         process, numbers = self.process, list[float](self.weights)
-        carried = process.carry(process.Extra(*[1.0] * len(process.Extra._fields)), Inputs(2.0, 3.0), None, 60.0)
+        carried = process.carry(
+            process.Extra(*[1.0] * len(process.Extra._fields)), Inputs(2.0, 3.0), Inputs(0.0, 0.0), 60.0
+        )
         for size in (10.0**power for power in range(-6, 5)):
             terms = process.cost_terms(process.Cost(*[size] * len(process.Cost._fields)), self.weights)
             numbers += [*terms, process.reward(terms, True), process.reward(terms, False)]

@@ -21,7 +21,7 @@ from cz_gym.engine.layout import Out
 from cz_gym.engine.tangents import ACTIONS, build_tangents, rows, smooth, work_shape
 from cz_gym.episodes.scenario import GRID
 from cz_gym.errors import CzError
-from cz_gym.process import scales
+from cz_gym.process import LOST
 
 Floats = npt.NDArray[np.float64]
 
@@ -30,7 +30,7 @@ class Step(NamedTuple):
     """The result of a step, one row per slot, and its derivatives."""
 
     state: Floats
-    """The numbers of :data:`STATES`, SI units, shape (n, 10)."""
+    """The differentiable state, of Cz-v0 :data:`STATES`, SI units, shape (n, 10)."""
     measured: npt.NDArray[np.float32]
     """The "measured" observation, shape (n, 12)."""
     cost: Floats
@@ -48,9 +48,9 @@ class Step(NamedTuple):
 
 
 STATES = smooth(BODY)
-"""The differentiable state: radius, meniscus height [m], T_1, T_2, T_b [K], v_p [m/s], Q_H [W], the mean
+"""The differentiable state of Cz-v0: radius, meniscus height [m], T_1, T_2, T_b [K], v_p [m/s], Q_H [W], the mean
 of v_p [m/s], the bright ring [m] and the camera's reading of it [m]. All else that a step depends on (disturbances,
-noise, time) depends on no action."""
+noise, time) depends on no action. That of another process is ``smooth(process)``."""
 
 
 class DifferentiableBatch:
@@ -58,9 +58,6 @@ class DifferentiableBatch:
 
     ``config`` is the environment's (:func:`cz_gym.config.make_config`). Its control interval may be up to the
     5 s for which disturbances are held, and its camera's latency must not be longer than the control interval.
-
-    On ``CzCrystal-v0`` derivatives of state and cost are whole; ``measured_by_state`` leaves out how references change
-    with the length.
 
     Noise, freezes and drop-outs are those of the environment; a held reading depends on the state at which it was
     taken. The derivatives ignore that the heater moves in whole steps and that observations are rounded; where a
@@ -83,7 +80,7 @@ class DifferentiableBatch:
         self.config = config = replace(config, observation="measured")
         self._made_for = config.made_for
         self._batch = Batch(config, self.num_envs, threads)
-        self._gather, self._tangents = build_tangents(config.process, config.meniscus)
+        self._gather, self._shown, self._tangents = build_tangents(config.process, config.meniscus)
         self._out = self._batch.new_out()
         self._names, info = smooth(config.process), config.process.info
         self._state = np.zeros((num_envs, len(self._names)))
@@ -93,8 +90,13 @@ class DifferentiableBatch:
         """Whether each crystal grew in the last step, and whether each slot has one, shape (n,)."""
         self._work = np.zeros(work_shape(config.process))
         self._jacobians = BufferPool((self.num_envs, len(rows(config.process)), len(self._names) + ACTIONS), np.float64)
-        self.measured_by_state = _measured_by_state(config)
-        """Derivatives of the "measured" observation with respect to the state, shape (12, 10)."""
+        shows = len(config.process.measured), len(self._names)
+        self._moves = config.process.nominal_moves
+        self._shows = BufferPool((self.num_envs if self._moves else 1, *shows), np.float64)
+        self.measured_by_state: Floats = np.zeros(shows)
+        """Derivatives of the last "measured" observation by the last state, shape (12, 10), the same for all slots and
+        steps; (n, 17, 17) on CzCrystal-v0, where references run with the length. Zero before the first reset, and for a
+        crystal that is lost."""
 
     def reset(self, seeds: Sequence[int], which: Sequence[int] | None = None) -> tuple[Floats, npt.NDArray[np.float32]]:
         """Draw the episodes of these seeds, one for each of the slots ``which``, by default all; the others stay.
@@ -115,7 +117,7 @@ class DifferentiableBatch:
         self._batch.reset(slots, keys, self._out)
         self.grows = self.grows.copy()
         self.grows[slots] = self._begun[slots] = True
-        self._state = self._now()
+        self._look(first=True)
         return self._state, self._out.observation
 
     def step(self, actions: npt.ArrayLike) -> Step:
@@ -138,7 +140,8 @@ class DifferentiableBatch:
         active = self.grows & (batch.memory.slots["k"] < batch.clock.steps)
         batch.step(given, out, active)
         self.grows = active & ~out.terminated
-        self._out, self._state = out, self._now()
+        self._out = out
+        self._look()
         jacobian = self._jacobians.new()
         step = (held, batch.actions, self.grows, batch.clock, batch.drives)
         self._tangents(batch.memory, before, *step, self._work, jacobian, 0, n)
@@ -154,10 +157,25 @@ class DifferentiableBatch:
             new[...] = old
         return out
 
+    def _look(self, first: bool = False) -> None:
+        """Read the slots' states, and how observations depend on them."""
+        self._state = self._now()
+        if self._moves or first:
+            shown, batch = self._shows.new(), self._batch
+            self._shown(batch.memory, batch.scales.measured, batch.clock.interval, shown, 0, len(shown))
+            shown[~self.grows[: len(shown)]] = 0.0  # those of a lost crystal may be infinite
+            self.measured_by_state = shown if self._moves else shown[0]
+
     def _now(self) -> Floats:
         state = np.empty((self.num_envs, len(self._names)))
         self._gather(self._batch.memory, state, 0, self.num_envs)
         return state
+
+    @property
+    def lost(self) -> npt.NDArray[np.bool_]:
+        """Whether each crystal is lost, shape (n,): one that has reached its length does not grow on either."""
+        lost: npt.NDArray[np.bool_] = ~self.grows & (self._batch.memory.slots["over"] == LOST)
+        return lost
 
     @property
     def scenarios(self) -> npt.NDArray[Any]:
@@ -167,14 +185,3 @@ class DifferentiableBatch:
     def close(self) -> None:
         """Stop the threads."""
         self._batch.close()
-
-
-def _measured_by_state(config: Config) -> Floats:
-    """Derivatives of "measured" with respect to the differentiable state, shape (12, 10)."""
-    channels, names = config.process.measured, smooth(config.process)
-    by_state, shown = np.zeros((len(channels), len(names))), scales(channels, *config.ranges)
-    for row, channel in enumerate(channels):
-        name = "reading" if channel.name == config.process.past[0].name else channel.name
-        if name in names:
-            by_state[row, names.index(name)] = 1.0 / shown[row]
-    return by_state

@@ -12,7 +12,7 @@ the meniscus model, ``t`` the time [s]. ``slot`` is a record of :func:`cz_gym.en
 Another process is one more value, in a room of its own:
 
 * References that run with length: ``nominal``, ``accept``, ``charged`` and ``measure`` see the state, and the
-  derivatives of a step follow them.
+  derivatives of a step follow them; where ``nominal`` does, :attr:`Process.nominal_moves` is true.
 * A recipe of each reset: :attr:`Process.table` is the shape of ``slot.table``, which ``begin`` fills, with random
   numbers from ``slot.streams`` where it needs some.
 * Numbers that outlive a step, as a running mean of the pull speed: the fields of :attr:`Process.Extra` stand in the
@@ -99,12 +99,21 @@ class Seen(NamedTuple):
     """Temperature at the pyrometer [K]."""
 
 
+class Readings(NamedTuple):
+    """The sensors' last readings, in fields of the slot."""
+
+    ring: Any
+    """The camera's of the bright ring, less the operator's bias [m]."""
+    T_1: Any
+    """The pyrometer's [K]."""
+
+
 class NoExtra(NamedTuple):
     """No numbers besides the state."""
 
 
 @jittable
-def carry_nothing(extra: Any, u: Any, slot: Any, interval: Any) -> Any:
+def carry_nothing(extra: Any, u: Any, nominal: Any, interval: Any) -> Any:
     """Nothing is carried on: a process without numbers besides the state."""
     return extra
 
@@ -169,7 +178,8 @@ class Process(NamedTuple):
     see: Function
     """``see(x, p, m)``: :class:`Seen`; complex for a complex state."""
     measure: Function
-    """``measure(slot, t)``: ``Measured``."""
+    """``measure(x, u, nominal, extra, readings, slot, t)``: ``Measured`` of state, ``Inputs``, those from which actions
+    are counted, ``Extra`` and :class:`Readings`; complex for complex ones."""
     true_state: Function
     """``true_state(slot, measured, t)``: ``TrueState``."""
     logged: Function
@@ -193,8 +203,11 @@ class Process(NamedTuple):
     Extra: Any = NoExtra
     """Numbers of a slot that outlive a step."""
     carry: Function = carry_nothing
-    """``carry(extra, u, slot, interval)``: ``Extra`` after the drives have moved to u; ``slot.v_p_nominal`` and
-    ``slot.Q_H_nominal`` are nominal now."""
+    """``carry(extra, u, nominal, interval)``: ``Extra`` after the drives have moved to u, counted from ``nominal``."""
+    nominal_moves: bool = False
+    """Whether ``nominal`` depends on the state."""
+    name: str = ""
+    """Name of its environment in ``gym.make``."""
     table: tuple[int, int] = (0, 0)
     """Rows and columns of ``slot.table``, which ``begin`` fills; none by default."""
     complete: Function = no_stages

@@ -15,27 +15,30 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_wrapper
 
-from cz_gym.body.signals import STATE
+from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.env import EnvState
 from cz_gym.errors import CzError
-from cz_gym.observation import HISTORY
-from cz_gym.support.names import needs
+from cz_gym.observation import observations
+from cz_gym.support.names import needs, unknown
 from cz_gym.vector import CzVectorEnv
 
 
 def make_vec_env(
-    num_envs: int, stagger: int | None = None, action_repeat: int = 1, critic_state: bool = False, **settings: Any
-) -> VecEnv:
-    """Many environments for stable-baselines3; ``settings`` are the keywords of ``gym.make("Cz-v0", ...)``.
+    num_envs: int, stagger: int | None = None, action_repeat: int = 1, critic_state: bool = False, env: str = "Cz-v0",
+    **settings: Any,
+) -> VecEnv:  # fmt: skip
+    """Many environments for stable-baselines3; ``settings`` are the keywords of ``gym.make(env, ...)``.
 
     ``stagger`` and ``critic_state`` are :class:`CzVecEnv`'s. With ``action_repeat`` above 1 each action is held for as
     many steps while an agent learns, whose effect is then easier to see (:class:`ActionRepeat`); a trained agent acts
     at every step.
     """
-    settings |= {"info": "all"} if critic_state else {}
+    if env not in ENVIRONMENTS:
+        raise CzError(unknown("environment", env, ENVIRONMENTS))
+    settings = {"process": ENVIRONMENTS[env]} | settings | ({"info": "all"} if critic_state else {})
     batch = CzVectorEnv(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
-    env = CzVecEnv(batch, stagger, critic_state)
-    return env if action_repeat == 1 else ActionRepeat(env, action_repeat)
+    slots = CzVecEnv(batch, stagger, critic_state)
+    return slots if action_repeat == 1 else ActionRepeat(slots, action_repeat)
 
 
 class CzVecEnv(VecEnv):
@@ -46,7 +49,7 @@ class CzVecEnv(VecEnv):
     stable-baselines3's ``Monitor``, and "c", the sum of the steps' ``info["cost"]``. ``cost`` has those of the last
     step, shape (num_envs,). With ``stagger``, a seed, each slot's first episode is cut (truncated) at a random step, so
     that slots are not all in the same minute. With ``critic_state`` the plant's true state
-    (:class:`cz_gym.body.signals.TrueState`) follows the channels of ``observation="history"``, for a
+    (the channels of "state") follows the channels of ``observation="history"``, for a
     policy of :mod:`cz_gym.agents.asymmetric`; the batch needs ``info="all"``.
     """
 
@@ -60,7 +63,8 @@ class CzVecEnv(VecEnv):
         if critic_state:
             if env.config.observation != "history":
                 raise CzError(f"critic_state needs observation='history', not {env.config.observation!r}")
-            space = Box(-np.inf, np.inf, (len(HISTORY) + len(STATE),), np.float32)
+            width = len(observations(env.config.process)["history"]) + len(env.config.process.state)
+            space = Box(-np.inf, np.inf, (width,), np.float32)
         self.slots = [Slot(self, i) for i in range(env.num_envs)]
         super().__init__(env.num_envs, space, env.single_action_space)
         self._actions = np.zeros((env.num_envs, 2), np.float32)

@@ -16,7 +16,7 @@ SMALL_SAC = SAC(
 SMALL_APG = APG(num_envs=4, window=20, steps=160)
 QUICK = PPO(num_envs=64, action_repeat=2, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,), fewest_updates=1)
 """For runs of ``train.py``."""
-REFERENCES = dict.fromkeys(validation.REFERENCES, (0.2, 0.1))
+REFERENCES = dict.fromkeys(validation.REFERENCES["Cz-v0"], (0.2, 0.1))
 TRAIN_SEED = fleet.train_seed
 
 

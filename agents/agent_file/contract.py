@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from cz_gym.config import Config
+from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.errors import CzError
 from cz_gym.machine.puller import DEFAULT
-from cz_gym.observation import CLIP, OBSERVATIONS
+from cz_gym.observation import CLIP, observations
 from cz_gym.support.atomic_files import write_files
 
 FORMAT = "cz-gym-agent"
@@ -70,11 +71,18 @@ class Contract:
     """Hash of the ONNX file."""
     puller: str = DEFAULT.label
     """Name and hash of the puller file that it was trained for (:attr:`cz_gym.machine.puller.PullerFile.label`)."""
+    environment: str = "Cz-v0"
+    """Name of the environment that it was trained in."""
 
 
-def observation_hash(name: str) -> str:
+LATER = {"puller": DEFAULT.label, "environment": "Cz-v0"}
+"""Fields that older files do not have, and what is true of those."""
+
+
+def observation_hash(name: str, environment: str = "Cz-v0") -> str:
     """Hash of an observation's channels (16 hex digits): names, units and scales, not their explanations."""
-    channels = [(channel.name, channel.unit, channel.scale) for channel in OBSERVATIONS[name]]
+    listed = observations(ENVIRONMENTS[environment])[name]
+    channels = [(channel.name, channel.unit, channel.scale) for channel in listed]
     return hashlib.sha256(json.dumps([channels, CLIP]).encode()).hexdigest()[:16]
 
 
@@ -82,7 +90,7 @@ def facts_of(config: Config) -> dict[str, Any]:
     """The fields of a contract that follow from the environment's settings."""
     return {
         "observation": config.observation,
-        "channels": len(OBSERVATIONS[config.observation]),
+        "channels": len(observations(config.process)[config.observation]),
         "action": config.action,
         "control_interval": config.control_interval,
         "plant_hash": config.plant_hash,
@@ -90,6 +98,7 @@ def facts_of(config: Config) -> dict[str, Any]:
         "scenario": config.scenario.name,
         "scenario_hash": config.scenario.hash,
         "puller": config.puller.label,
+        "environment": config.process.name,
     }
 
 
@@ -99,8 +108,8 @@ def make_contract(onnx_bytes: bytes, **facts: Any) -> Contract:
     AgentFileError for a value that no contract may hold.
     """
     digest = hashlib.sha256(onnx_bytes).hexdigest()
-    known = {"puller": DEFAULT.label, **facts, "sha256": digest}
-    known["observation_hash"] = observation_hash(facts["observation"])
+    known = {**LATER, **facts, "sha256": digest}
+    known["observation_hash"] = observation_hash(facts["observation"], known["environment"])
     _check(known, "contract")
     return Contract(**known)
 
@@ -165,7 +174,7 @@ def _parse(path: Path) -> Contract:
         version = data.get("format_version")
         raise AgentFileError(f"{path}: format version {version!r:.80}, this release reads {FORMAT_VERSION}")
     wanted = {field.name for field in fields(Contract)}
-    given = {"puller": DEFAULT.label, **data}  # older files are for the default puller, and do not say so
+    given = {**LATER, **data}
     del given["format"], given["format_version"]
     if set(given) != wanted:
         odd = sorted(set(given) ^ wanted)[0]

@@ -33,14 +33,14 @@ NORMS = 100
 
 
 class APG(BaseAlgorithm):
-    """Analytic policy gradients on Cz-v0.
+    """Analytic policy gradients on Cz-v0 or CzCrystal-v0.
 
-    ``env`` says what is learned: a vector environment of Cz-v0 with ``observation="measured"``. Training steps a
+    ``env`` says what is learned: a vector environment with ``observation="measured"``. Training steps a
     differentiable twin of it with as many slots; ``env`` itself is only asked for its settings. ``window`` is the
     number of steps that a gradient goes back through; each update takes ``window * num_envs`` environment steps.
     The cost is :class:`.plant_step.StepCost`; a constant ``learning_rate`` falls linearly to 0.
-    The other arguments are stable-baselines3's. Raises CzError for an environment that is not Cz-v0's, or reads another
-    observation.
+    The other arguments are stable-baselines3's. Raises CzError for an environment that is not this package's, or reads
+    another observation.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"RecurrentPolicy": RecurrentPolicy}
@@ -74,6 +74,7 @@ class APG(BaseAlgorithm):
         options = dict(self.policy_kwargs)
         if self.env is not None:
             options.setdefault("interval", self._config().control_interval)
+            options.setdefault("environment", self._config().process.name)
         policy: Any = self.policy_class
         self.policy = policy(self.observation_space, self.action_space, self.lr_schedule, **options).to(self.device)
 
@@ -82,7 +83,7 @@ class APG(BaseAlgorithm):
         try:
             config: Config = self.get_env().get_attr("config")[0]  # type: ignore[union-attr]  # None: said below
         except AttributeError:
-            raise CzError("APG differentiates the plant of Cz-v0: env must be made of Cz-v0 environments") from None
+            raise CzError("APG differentiates the plant of Cz-v0 or CzCrystal-v0: env must be made of these") from None
         if config.observation != "measured":
             raise CzError(f'APG reads observation="measured" and remembers itself, not {config.observation!r}')
         return config
@@ -181,10 +182,10 @@ class _Crystals:
 
     def renew(self) -> tuple[int, list[int]]:
         """Draw new crystals for those that were lost or have grown to their end: how many were lost, and all slots."""
-        lost = ~self.batch.grows
+        lost = int(self.batch.lost.sum())
         self._left -= 1
-        over = np.flatnonzero(lost | (self._left == 0)).tolist()
+        over = np.flatnonzero(~self.batch.grows | (self._left == 0)).tolist()
         if over:
             self._draw(over)
             self._left[over] = self._windows
-        return int(lost.sum()), over
+        return lost, over

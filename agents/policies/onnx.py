@@ -11,8 +11,9 @@ from cz_gym.action import ACTIONS, MadeFor, mark
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, observation_hash, read_agent
 from cz_gym.agents.agent_file.graph import GraphError, checked
 from cz_gym.config import Config, check_config
+from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.errors import CzError
-from cz_gym.observation import OBSERVATIONS
+from cz_gym.observation import observations
 
 Floats = npt.NDArray[np.float32]
 
@@ -48,18 +49,26 @@ class OnnxPolicy:
         cls, contract: Contract, onnx_bytes: bytes, config: Config | None = None, path: str | Path = "agent"
     ) -> Self:
         """An agent from its contract and ONNX file; ``path`` names it in errors."""
-        for name, known in ((contract.observation, OBSERVATIONS), (contract.action, ACTIONS)):
-            if name not in known:
+        environment, known = contract.environment, dict[str, Any]()
+        if environment in ENVIRONMENTS:
+            known = observations(ENVIRONMENTS[environment])
+        for name, names in ((environment, ENVIRONMENTS), (contract.observation, known), (contract.action, ACTIONS)):
+            if name not in names:
                 raise AgentFileError(f"{path}: made for {name!r}, which this release does not have")
-        expected = len(OBSERVATIONS[contract.observation])
-        if (contract.channels, contract.observation_hash) != (expected, observation_hash(contract.observation)):
+        expected = len(known[contract.observation])
+        digest = observation_hash(contract.observation, environment)
+        if (contract.channels, contract.observation_hash) != (expected, digest):
             raise AgentFileError(
                 f"{path}: reads {contract.channels} channels of {contract.observation!r}; this release's has "
                 f"{expected}, or others, or other scales"
             )
         if config is not None:
+            if environment != (own := check_config(config).process.name):
+                raise AgentFileError(
+                    f"{path}: trained for {environment}, not for {own or 'an environment of your own'}"
+                )
             for what, own, other in (
-                ("puller", contract.puller, check_config(config).puller.label),
+                ("puller", contract.puller, config.puller.label),
                 ("plant", contract.plant_hash, config.plant_hash),
             ):
                 if own != other:
@@ -89,7 +98,7 @@ class OnnxPolicy:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Its arguments of ``gym.make("Cz-v0", ...)``: observation, action and control interval [s]."""
+        """Its arguments of ``gym.make(contract.environment, ...)``: observation, action and control interval [s]."""
         return {name: getattr(self.contract, name) for name in ("observation", "action", "control_interval")}
 
     def predict(
@@ -105,7 +114,7 @@ class OnnxPolicy:
         if array.ndim not in (1, 2) or array.shape[-1] != self.contract.channels:
             raise CzError(
                 f"expected {self.contract.channels} channels ({self.observation}), got shape {array.shape}: "
-                'gym.make("Cz-v0", **agent.settings) gives them'
+                f'gym.make("{self.contract.environment}", **agent.settings) gives them'
             )
         rows = np.atleast_2d(array)
         if not self.remembers:

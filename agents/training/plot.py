@@ -5,7 +5,7 @@ from typing import Any
 
 from cz_gym.evaluation.report.canvas import INK, canvas, png, styles
 
-from .validation import REFERENCES
+from .validation import COLUMNS
 
 AXES = (("steps", 1e6, "environment steps [million]"), ("seconds", 60.0, "minutes, validation included"))
 """Horizontal axes: column of a run's progress, unit, label."""
@@ -26,10 +26,11 @@ def curves(runs: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> bytes:
                 look = {"color": style[name].colour, "marker": style[name].marker}
                 label = name if place == 0 and axis is panels[0] else None
                 axis.plot([each / unit for each in spent], error, ms=2.5, lw=1.0, label=label, **look)
-        for name in REFERENCES:
-            axis.axhline(rmse := float(last[f"{name}_rmse_mm"]), color=INK, lw=0.9, ls="--")
+        for name in [*last][len(COLUMNS) :]:
+            axis.axhline(rmse := float(last[name]), color=INK, lw=0.9, ls="--")
             if axis is panels[0]:
-                axis.annotate(name, (0.99, rmse), (0, 2), axis.get_yaxis_transform(), textcoords="offset points",
+                named = name.removesuffix("_rmse_mm")
+                axis.annotate(named, (0.99, rmse), (0, 2), axis.get_yaxis_transform(), textcoords="offset points",
                               ha="right", fontsize=8, color=INK)  # fmt: skip
         axis.set(xscale="log", yscale="log", xlabel=title)
         for each in (axis.xaxis, axis.yaxis):

@@ -5,13 +5,15 @@ A new recipe needs a line in :data:`RECIPES`; a new kind needs a dataclass here 
 """
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Any, Self
 
 from cz_gym.config import Config, make_config
+from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.evaluation.user_code import scenarios
 
 LEAST_ENVS, LEAST_BATCH = 8, 64
 """Least number of crystals at a time, and of samples in a batch, on a small budget."""
+CZ, CRYSTAL = ENVIRONMENTS
 FEW_UPDATES = 50
 """Number of updates below which nothing is learned."""
 
@@ -37,6 +39,10 @@ class Recipe:
     """Time between actions on the default puller [s]."""
     puller: str = ""
     """Puller file, or name of a shipped one, which has a control interval of its own; empty: the default puller."""
+    environment: str = ""
+    """Name of the environment; empty: Cz-v0."""
+    stages: tuple[str, ...] = ()
+    """Parts of the crystal that the training and validation crystals grow, in equal shares; none on Cz-v0."""
 
     fewest_updates: int
     """Number of updates below which a smaller budget has fewer crystals at a time instead."""
@@ -61,8 +67,9 @@ class Recipe:
         """The environment that the recipe's agents act in."""
         interval, puller = (None, self.puller) if self.puller else (self.control_interval, None)
         return make_config(
-            scenarios(self.scenario), None, self.observation, interval, action=self.action, puller=puller
-        )
+            scenarios(self.scenario), None, self.observation, interval, action=self.action, puller=puller,
+            process=ENVIRONMENTS[self.environment or CZ], stage=dict.fromkeys(self.stages, 1.0) or None,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,5 +186,8 @@ PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64))
 """stable-baselines3's own PPO, told nothing: beside ``ppo`` it shows what the true state is worth in training."""
 RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG())}
 """Recipes by name: the choices of ``train.py --algo``."""
+_along: dict[str, Any] = {"environment": CRYSTAL, "stages": ("crown", "body", "tail"), "scenario": "randomized"}
+CRYSTAL_RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in (PPO(**_along), APG(num_envs=96, **_along))}
+"""Recipes of CzCrystal-v0: one agent for crown, body and tail."""
 DEFAULT = "ppo"
 """The recipe that train.py follows unless another is named."""

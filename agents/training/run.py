@@ -26,7 +26,7 @@ from .algorithms import make_algorithm, repeat_of
 from .checkpoint import load_checkpoint, restore, to_bytes
 from .recipes import Recipe
 from .run_files import check_settings, identity, provenance, read_rows, to_csv, to_json
-from .validation import COLUMNS, REFERENCES, References, validate
+from .validation import COLUMNS, References, beside, validate
 
 CHECKPOINT = "checkpoint.zip"
 VALIDATE_EVERY = 200_000
@@ -136,7 +136,7 @@ class Run:
             "validation_episodes": len(validation.JUDGING),
             "validation_cost": figures.cost,
             "validation_rmse_mm": figures.rmse_mm,
-            **{f"{name}_rmse_mm": judged for name, (_, judged) in self.job.references.items()},
+            **{beside(name): judged for name, (_, judged) in self.job.references.items()},
             "pull_step_rms_mm_per_min": figures.pull_step_rms_mm_per_min,
             "failure_rate": figures.failure_rate,
             "chosen_at": agent.contract.training_steps,
@@ -157,9 +157,9 @@ class Run:
         if self.best is None or figures.cost < self.best:
             self.best = figures.cost
             self._hold(agent_files(path, agent.content, figures.put_into(agent.contract)))
-        picked = [picked for picked, _ in self.job.references.values()]
-        row = self.steps, round(time.monotonic() - self.began, 1), *figures, *picked
-        self.rows.append(dict(zip(COLUMNS, row, strict=True)))
+        picked = {name: picked for name, (picked, _) in self.job.references.items()}
+        row = self.steps, round(time.monotonic() - self.began, 1), *figures, *picked.values()
+        self.rows.append(dict(zip((*COLUMNS, *map(beside, picked)), row, strict=True)))
         self._hold({self.folder / "progress.csv": to_csv(self.rows)})
         if self.job.plot:
             from .plot import curves
@@ -168,8 +168,8 @@ class Run:
         self.save()
         for name, figure in figures._asdict().items():
             self.logger.record(f"validation/{name}", figure)
-        beside = ", ".join(f"{name} {rmse:.3f}" for name, rmse in zip(REFERENCES, picked, strict=True))
-        figures_now = f"RMSE {figures.rmse_mm:.3f} mm, {figures.failure_rate:.0%} lost ({beside})"
+        others = ", ".join(f"{name} {rmse:.3f}" for name, rmse in picked.items())
+        figures_now = f"RMSE {figures.rmse_mm:.3f} mm, {figures.failure_rate:.0%} lost ({others})"
         bar.set_postfix_str(figures_now)
         if not sys.stderr.isatty() and parent_process() is None:  # a log holds lines
             print(f"{self.steps:,} steps: {figures_now}", flush=True)

@@ -34,7 +34,7 @@ def check_settings(folder: Path, recipe: Recipe, seed: int) -> list[dict[str, An
 
 def identity(recipe: Recipe, seed: int) -> dict[str, Any]:
     """The settings that a resumed run must share with the one that was begun; it may be longer."""
-    settings = {name: value for name, value in asdict(recipe).items() if name != "steps" and value != ""}
+    settings = {name: value for name, value in asdict(recipe).items() if name != "steps" and value not in ("", ())}
     return {
         "algorithm": recipe.name,
         "seed": seed,
@@ -92,7 +92,8 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         return []
     try:
         rows = list(csv.DictReader(io.StringIO(read_bounded(path, MAX_JSON_BYTES).decode(), newline="")))
-        if not all(list(row) == list(COLUMNS) and all(math.isfinite(float(row[name])) for name in row) for row in rows):
+        named = all(list(row)[: len(COLUMNS)] == list(COLUMNS) for row in rows)
+        if not named or not all(math.isfinite(float(value)) for row in rows for value in row.values()):
             raise ValueError
     except (ValueError, TypeError, csv.Error):
         raise AgentFileError(f"{path}: damaged; without it the run can be resumed") from None

@@ -22,15 +22,12 @@ PICKING = VALIDATION_SEEDS[:64]
 JUDGING = VALIDATION_SEEDS[64:264]
 """Seeds of the crystals that a finished run's agent is tested on; they choose nothing within a run."""
 
-REFERENCES = ("paper", "paper-tuned", "lqg")
-"""Classical controllers that an agent is shown beside while it learns."""
+REFERENCES = {"Cz-v0": ("paper", "paper-tuned", "lqg"), "CzCrystal-v0": ("compensated", "lqg-along")}
+"""Classical controllers that an agent is shown beside while it learns, by environment."""
 References = Mapping[str, tuple[float, float]]
 """Mean RMSE of each reference [mm], on the crystals of PICKING and of JUDGING."""
-COLUMNS = (
-    "steps", "seconds", "validation_cost", "validation_rmse_mm", "pull_step_rms_mm_per_min", "failure_rate",
-    *(f"{name}_rmse_mm" for name in REFERENCES),
-)  # fmt: skip
-"""Figures of a validation; those of the references are the same in every row."""
+COLUMNS = "steps", "seconds", "validation_cost", "validation_rmse_mm", "pull_step_rms_mm_per_min", "failure_rate"
+"""Figures of a validation; :func:`beside` names those of the references, which follow, the same in every row."""
 
 
 class Validation(NamedTuple):
@@ -47,6 +44,11 @@ class Validation(NamedTuple):
         return replace(contract, validation_cost=self.cost, validation_rmse_mm=self.rmse_mm)
 
 
+def beside(name: str) -> str:
+    """Name of the column with the RMSE of a reference [mm]."""
+    return f"{name}_rmse_mm"
+
+
 def validate(policy: Any, config: Config, seeds: Sequence[int]) -> Validation:
     """Run one episode a seed."""
     measured = metrics(rollout(policy, config, seeds))
@@ -60,7 +62,7 @@ def references(make_controller: Callable[[str, Config], Any], recipe: Recipe) ->
     # Classical controllers are designed for one scenario.
     design = config if len(config.scenario.scenarios) == 1 else config.with_scenario("randomized")
     found = {}
-    for name in REFERENCES:
+    for name in REFERENCES[config.process.name]:
         policy = make_controller(name, design)
         found[name] = validate(policy, config, PICKING).rmse_mm, validate(policy, config, JUDGING).rmse_mm
     return found

@@ -126,7 +126,7 @@ def lean(slot: Any, measured: Any) -> Any:
 
 
 @jittable
-def carry(extra: Any, u: Any, slot: Any, interval: Any) -> Any:
+def carry(extra: Any, u: Any, nominal: Any, interval: Any) -> Any:
     """The mean pull speed after an interval."""
     return Extra(cost.moved_mean(extra.v_p_mean, u.v_p, interval))
 
@@ -184,4 +184,5 @@ BODY = Process(
     weights=cost.WEIGHTS,
     Extra=Extra,
     carry=carry,
+    name="Cz-v0",
 )

@@ -47,12 +47,12 @@ class Measured(NamedTuple):
 
 
 @jittable
-def measure(slot: Any, t: Any) -> Any:
+def measure(x: Any, u: Any, nominal: Any, extra: Any, readings: Any, slot: Any, t: Any) -> Any:
     """:class:`Measured` of a slot at its sample's time t [s]."""
     p, e = slot.puller, slot.episode
     r_ref = reference(t, e)
     return Measured(
-        ring_error=slot.ring - p.r_0 - r_ref,
+        ring_error=readings.ring - p.r_0 - r_ref,
         valid=slot.valid,
         r_ref=r_ref,
         r_ref_1min=reference(t + _IN_1_MIN, e),
@@ -60,10 +60,10 @@ def measure(slot: Any, t: Any) -> Any:
         T_1_ref=recipe(t, e),
         T_1_ref_1min=recipe(t + _IN_1_MIN, e),
         T_1_ref_5min=recipe(t + _IN_5_MIN, e),
-        T_1=slot.T_1 - p.T_1_0,
-        v_p=slot.v_p - p.v_0,
-        Q_H=slot.Q_H - p.Q_H_0,
-        v_p_mean=slot.v_p_mean - p.v_0,
+        T_1=readings.T_1 - p.T_1_0,
+        v_p=u.v_p - p.v_0,
+        Q_H=u.Q_H - p.Q_H_0,
+        v_p_mean=extra.v_p_mean - p.v_0,
     )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from cz_gym.agents.training.recipes import DEFAULT, FEW_UPDATES, RECIPES, Recipe
+from cz_gym.agents.training.recipes import CRYSTAL, CRYSTAL_RECIPES, CZ, DEFAULT, FEW_UPDATES, RECIPES, Recipe
 from cz_gym.agents.training.run_files import read_settings
 from cz_gym.baselines.registry import make_controller
 from cz_gym.config import check_config
@@ -25,6 +25,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     )
     add = parser.add_argument
     add("--algo", choices=RECIPES, help=f"recipe (default: {DEFAULT}, or the resumed run's)")
+    add("--env", choices=(CZ, CRYSTAL), help=f"environment (default: {CZ}, or the resumed run's)")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--seed", type=between(0, 2**63 - 1), help="training seed (default: 0, or the resumed run's)")
     about = "training seeds side by side, a processor each; with --resume those that are not finished"
@@ -46,7 +47,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         parser.error("--cluster shares --seeds FIRST-LAST between machines: a single seed is one task")
     suffix = "" if arguments.seeds else f"-seed{arguments.seed or 0}"
     puller = f"-{Path(arguments.puller).stem}" if arguments.puller else ""
-    arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT}{puller}{suffix}"
+    crystal = "-crystal" if arguments.env == CRYSTAL else ""
+    arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT}{crystal}{puller}{suffix}"
     return arguments
 
 
@@ -82,7 +84,8 @@ def train(arguments: argparse.Namespace) -> int:
     machine = f", puller {recipe.config.puller.label}" if recipe.puller else ""
     if recipe.updates < FEW_UPDATES:
         print(f"{recipe.steps:,} steps are {recipe.updates} updates of {recipe.name}: too few to learn from")
-    print(f"{recipe.name}, {what} on {recipe.config.scenario.name}{machine}, into {arguments.out}")
+    where = f"{recipe.environment} ({', '.join(recipe.stages)}), " if recipe.environment else ""
+    print(f"{recipe.name}, {what} on {where}{recipe.config.scenario.name}{machine}, into {arguments.out}")
     if not arguments.seeds:
         with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, disable=None) as bar:
             summary = train_seed(jobs[0], bar)
@@ -113,15 +116,16 @@ def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tupl
         raise CzError(f"{begun[0]} holds a run already: --resume it, or name another --out")
     saved = read_settings((begun or folders)[0] / "settings.json") if arguments.resume else {}
     name, settings = arguments.algo or saved.get("algorithm", DEFAULT), saved.get("settings", {})
-    if name not in RECIPES:
-        raise CzError(f"{arguments.out}: begun with {name!r}, which is no recipe here: name one by --algo")
+    recipes = CRYSTAL_RECIPES if (arguments.env or settings.get("environment")) == CRYSTAL else RECIPES
+    if name not in recipes:
+        raise CzError(f"{name!r} is no recipe here: name one of {', '.join(recipes)} by --algo")
     chosen = {
         "steps": arguments.steps or saved.get("steps"),
         "scenario": arguments.scenario or settings.get("scenario"),
         "puller": arguments.puller or settings.get("puller"),
     }
     begun_with = {field: settings[field] for field in ("num_envs", "batch_size") if field in settings}
-    recipe = replace(RECIPES[name].with_steps(chosen.pop("steps") or RECIPES[name].steps), **begun_with)
+    recipe = replace(recipes[name].with_steps(chosen.pop("steps") or recipes[name].steps), **begun_with)
     recipe = replace(recipe, **{field: value for field, value in chosen.items() if value})
     chosen_puller(recipe.puller or None)
     check_config(recipe.config)

@@ -13,6 +13,7 @@ import numpy as np
 from cz_gym.body.plant import Puller, derive_puller, heating, interface
 from cz_gym.episodes.draw import randomised
 from cz_gym.jit.compile import force_inlined, jittable, joined
+from cz_gym.physics.arithmetic import clip
 
 
 class State(NamedTuple):
@@ -47,6 +48,8 @@ class Disturbance(NamedTuple):
     """Fluctuation of the temperature that drives the interface flux [K]."""
 
 
+LONG = 30.0
+"""Length of a fin from which on nothing changes, in its own lengths [-]; a complex tanh of 400 overflows."""
 NO_DISTURBANCE = Disturbance(0.0, 0.0)
 
 
@@ -126,7 +129,7 @@ def depth(M_s: Any, M_men: Any, p: Any) -> Any:
 def crystal_flux(r_c: Any, A_s: Any, deep: Any, p: Any) -> Any:
     """Heat flux from the interface into the crystal Phi_s [W/m2], at this relative depth of the melt."""
     thin = p.r_0 / r_c
-    fin = np.tanh(A_s / (2.0 * math.pi * r_c * p.l_0) * np.sqrt(thin))
+    fin = np.tanh(clip(A_s / (2.0 * math.pi * r_c * p.l_0) * np.sqrt(thin), LONG))
     return p.Phi_s * thin**p.m * (1.0 - p.beta * (1.0 - deep)) * fin
 
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from cz_gym.body import cost
 from cz_gym.body.plant import hidden_load
+from cz_gym.body.process import BODY
 from cz_gym.body.task import HEIGHT_MAX_IN_A
 from cz_gym.episodes.record import Episode, Factors
 from cz_gym.episodes.scenario import DRAW_SPAN
@@ -151,9 +152,9 @@ def lean(slot: Any, measured: Any) -> Any:
 
 
 @jittable
-def carry(extra: Any, u: Any, slot: Any, interval: Any) -> Any:
+def carry(extra: Any, u: Any, nominal: Any, interval: Any) -> Any:
     """The mean pull speed above the recipe's after an interval."""
-    return Extra(cost.moved_mean(extra.v_p_mean, u.v_p - slot.v_p_nominal, interval), extra.stop)
+    return Extra(cost.moved_mean(extra.v_p_mean, u.v_p - nominal.v_p, interval), extra.stop)
 
 
 @jittable
@@ -210,8 +211,12 @@ CRYSTAL = Process(
     weights=cost.WEIGHTS,
     Extra=Extra,
     carry=carry,
+    nominal_moves=True,
+    name="CzCrystal-v0",
     table=recipe.TABLE,
     complete=complete,
     apart=APART,
     duration=duration,
 )
+ENVIRONMENTS = {each.name: each for each in (BODY, CRYSTAL)}
+"""The processes by the names of their environments."""

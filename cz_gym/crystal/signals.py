@@ -45,10 +45,20 @@ def recipe_error(L: Any, e: Any) -> Any:
 
 @jittable
 def weight(x: Any, p: Any) -> Any:
-    """What hangs on the load cell [N]: crystal and meniscus, at Hurle's angle, in whole steps of its resolution."""
+    """What hangs on the load cell [N]: crystal and meniscus, at Hurle's angle, in whole steps of its resolution.
+
+    A small imaginary part is not rounded.
+    """
     h_c = height_inside(x.h_c, p)
-    M_men = meniscus_mass(x.r_c, h_c, hurle_slope(x.r_c, h_c, p)[1], p)
-    return p.g * WEIGHT_STEP * np.rint((x.M_s + M_men) / WEIGHT_STEP)
+    hangs = x.M_s + meniscus_mass(x.r_c, h_c, hurle_slope(x.r_c, h_c, p)[1], p)
+    return p.g * WEIGHT_STEP * np.rint(hangs.real / WEIGHT_STEP) + p.g * (hangs - hangs.real)
+
+
+@jittable
+def later(L: Any, by: Any, p: Any) -> Any:
+    """A length further on [m], at most the whole crystal's."""
+    further, last = L + by, end(p)
+    return further if further.real < last else last + 0.0 * L
 
 
 class Measured(NamedTuple):
@@ -79,13 +89,13 @@ class Measured(NamedTuple):
 
 
 @jittable
-def measure(slot: Any, t: Any) -> Any:
+def measure(x: Any, u: Any, nominal: Any, extra: Any, readings: Any, slot: Any, t: Any) -> Any:
     """:class:`Measured` of a slot at its sample's time t [s]."""
-    p, e, L = slot.puller, slot.episode, slot.x.L
-    near, far = min(L + NEAR, end(p)), min(L + FAR, end(p))
+    p, e, L = slot.puller, slot.episode, x.L
+    near, far = later(L, NEAR, p), later(L, FAR, p)
     now, shift = shape_at(L, p, e), drift(t, e) - p.T_1_0
     return Measured(
-        ring_error=slot.ring - now.r - value(L, slot, recipe._ring),
+        ring_error=readings.ring - now.r - value(L, slot, recipe._ring),
         valid=slot.valid,
         r_ref=now.r - p.r_0,
         r_ref_5mm=shape_at(near, p, e).r - p.r_0,
@@ -93,15 +103,15 @@ def measure(slot: Any, t: Any) -> Any:
         T_1_ref=value(L, slot, recipe._T_1) + recipe_error(L, e) + shift,
         T_1_ref_5mm=value(near, slot, recipe._T_1) + recipe_error(near, e) + shift,
         T_1_ref_25mm=value(far, slot, recipe._T_1) + recipe_error(far, e) + shift,
-        T_1=slot.T_1 - p.T_1_0,
-        v_p=slot.v_p - slot.v_p_nominal,
-        Q_H=slot.Q_H - slot.Q_H_nominal,
-        v_p_mean=slot.v_p_mean,
+        T_1=readings.T_1 - p.T_1_0,
+        v_p=u.v_p - nominal.v_p,
+        Q_H=u.Q_H - nominal.Q_H,
+        v_p_mean=extra.v_p_mean,
         alpha_ref=np.arctan(now.slope),
         L=L,
-        v_p_ref=slot.v_p_nominal - p.v_0,
-        Q_H_ref=slot.Q_H_nominal - p.Q_H_0,
-        weight=weight(slot.x, p) - p.g * (value(L, slot, recipe._M_s) + value(L, slot, recipe._M_men)),
+        v_p_ref=nominal.v_p - p.v_0,
+        Q_H_ref=nominal.Q_H - p.Q_H_0,
+        weight=weight(x, p) - p.g * (value(L, slot, recipe._M_s) + value(L, slot, recipe._M_men)),
     )
 
 

@@ -29,12 +29,13 @@ def next_power(Q_H: Any, heat: Any, drives: Any, nominal: Any, before: Any, e: A
 
 
 @jittable
-def next_inputs(x: Any, u: Any, action: Any, drives: Any, slot: Any, interval: Any, process: Any) -> Any:
-    """The inputs after an action, before the heater is rounded to whole steps, from those before and the state."""
+def next_inputs(x: Any, u: Any, action: Any, before: Any, drives: Any, slot: Any, interval: Any, process: Any) -> Any:
+    """The inputs after an action, before the heater is rounded to whole steps, from those before and the state;
+    ``before`` are the inputs from which the last action was counted."""
     e, nominal = slot.episode, process.nominal(x, slot, interval)
     return Inputs(
-        next_speed(u.v_p, action.v_p, drives, nominal.v_p, slot.v_p_nominal, e, interval),
-        next_power(u.Q_H, action.Q_H, drives, nominal.Q_H, slot.Q_H_nominal, e, interval),
+        next_speed(u.v_p, action.v_p, drives, nominal.v_p, before.v_p, e, interval),
+        next_power(u.Q_H, action.Q_H, drives, nominal.Q_H, before.Q_H, e, interval),
     )
 
 
@@ -44,14 +45,14 @@ def drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any, process: 
     e, x = slot.episode, labelled(process.State, slot.x)
     slot.v_p_before, slot.Q_H_before = slot.v_p, slot.Q_H
     slot.clipped = 1.0 if (np.abs(pull) > 1.0 or np.abs(heat) > 1.0) else 0.0
-    nominal = process.nominal(x, slot, interval)
-    u = next_inputs(x, Inputs(slot.v_p, slot.Q_H_slewed), Inputs(pull, heat), drives, slot, interval, process)
+    nominal, before = process.nominal(x, slot, interval), Inputs(slot.v_p_nominal, slot.Q_H_nominal)
+    u = next_inputs(x, Inputs(slot.v_p, slot.Q_H_slewed), Inputs(pull, heat), before, drives, slot, interval, process)
     slot.v_p, slot.Q_H_slewed, slot.Q_H = u.v_p, u.Q_H, u.Q_H
     slot.v_p_nominal, slot.Q_H_nominal = nominal.v_p, nominal.Q_H
     if e.heater_step > 0.0:
         whole = nominal.Q_H + e.heater_step * np.rint((slot.Q_H_slewed - nominal.Q_H) / e.heater_step)
         slot.Q_H = np.maximum(whole, 0.0)
-    extra = process.carry(labelled(process.Extra, slot), labelled(Inputs, slot), slot, interval)
+    extra = process.carry(labelled(process.Extra, slot), labelled(Inputs, slot), nominal, interval)
     set_labelled(process.Extra, extra, slot)
 
 

@@ -15,7 +15,7 @@ from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import fetch, inlined, jittable, kernel, labelled, set_labelled
 from cz_gym.physics.arithmetic import along
 from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.process import GROWS, LOST, Inputs, Process
+from cz_gym.process import GROWS, LOST, Inputs, Process, Readings
 
 from .drives import drive
 from .layout import model_of
@@ -53,7 +53,9 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, 
     if fresh:
         camera, pyrometer = sample_noise(slot.episode, slot.streams)
         sense(slot, camera, pyrometer, memory.frames[i], t, seen)
-    measured = process.measure(slot, t)
+    u, before, extra = labelled(Inputs, slot), Inputs(slot.v_p_before, slot.Q_H_before), labelled(process.Extra, slot)
+    nominal = Inputs(slot.v_p_nominal, slot.Q_H_nominal)
+    measured = process.measure(x, u, nominal, extra, labelled(Readings, slot), slot, t)
     row = out.observation[i]
     write_channels(measured, scales.measured, row)
     if memory.history.shape[1] > 0:
@@ -62,9 +64,7 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, 
         recall(slot, measured, memory.history[i], scales, row, process)
     if out.state.shape[1] > 0:
         write_channels(process.true_state(slot, measured, t), scales.state, out.state[i])
-    u, before = labelled(Inputs, slot), Inputs(slot.v_p_before, slot.Q_H_before)
-    charged = process.charged(x, u, before, labelled(process.Extra, slot), slot, t)
-    cost = process.cost_terms(charged, clock.weights)
+    cost = process.cost_terms(process.charged(x, u, before, extra, slot, t), clock.weights)
     if slot.k == 0:
         cost = along(cost, -1.0, cost)
     if scales.everything:

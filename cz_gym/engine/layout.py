@@ -10,7 +10,7 @@ from cz_gym.episodes.rng import WORDS
 from cz_gym.errors import CzError
 from cz_gym.jit.compile import static
 from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.process import Inputs, Process
+from cz_gym.process import Inputs, Process, Readings
 
 
 def _record(kind: Any) -> np.dtype[Any]:
@@ -89,6 +89,10 @@ class Model(NamedTuple):
     """Place in the differentiable state of what the process carries on; number of states and inputs."""
     extras: int
     """Number of what the process carries on."""
+    nominal: int
+    """Place of the nominal inputs in the differentiable state."""
+    nominals: int
+    """Number of the nominal inputs there: none where they do not move."""
     ring: int
     """Place of the ring in the differentiable state; the reading follows."""
     smooth: int
@@ -98,11 +102,15 @@ class Model(NamedTuple):
     costs: int
     """Number of terms of the cost."""
     driven_by: int
-    """Number of what the next inputs depend on: state, inputs, actions."""
+    """Number of what the next inputs depend on: state, inputs, actions, the nominal inputs before."""
     carried_by: int
-    """Number of what the carried numbers depend on: themselves and the inputs."""
+    """Number of what the carried numbers depend on: themselves, the inputs, the nominal ones."""
     charged_by: int
     """Number of what the cost depends on: state, inputs and those before, what is carried on."""
+    channels: int
+    """Number of channels of "measured"."""
+    shown_by: int
+    """Number of what these depend on: state, inputs, the nominal ones, what is carried on, readings."""
 
 
 @cache
@@ -113,12 +121,14 @@ def model_of(process: Process, meniscus: MeniscusModel) -> Model:
         len(kind._fields)
         for kind in (process.Constants, process.State, process.Disturbance, process.Extra, process.Cost)
     )
-    u_at, ring = constants + states, states + u + extras
+    u_at, nominal, nominals = constants + states, states + u + extras, u if process.nominal_moves else 0
+    ring = nominal + nominals
     dt_at, lean = u_at + u + loads, (*process.Lean._fields, "action_clipped")
     return Model(
         process, meniscus, stride, stride - process.table[0] * process.table[1], len(process.info),
         tuple(map(process.info.index, lean)), constants, states, u_at, u_at + 1, u_at + u, dt_at, dt_at + 3,
-        states + u, extras, ring, ring + 2, ring + 2 + u, costs, states + 2 * u, extras + u, states + 2 * u + extras,
+        states + u, extras, nominal, nominals, ring, ring + 2, ring + 2 + u, costs, states + 3 * u, extras + 2 * u,
+        states + 2 * u + extras, len(process.measured), states + 2 * u + extras + len(Readings._fields),
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from cz_gym.jit.cache import hashed
 from cz_gym.jit.compile import column, compiled_as, jittable, kernel, labelled, scratch, set_column
 from cz_gym.physics.arithmetic import along, plus_product, rk4
 from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.process import Inputs, Process, Seen
+from cz_gym.process import Inputs, Process, Readings, Seen
 
 from .drives import next_inputs
 from .layout import model_of
@@ -27,9 +27,10 @@ _INPUTS = len(Inputs._fields)
 
 def smooth(process: Process) -> tuple[str, ...]:
     """Names of the differentiable state: the plant's; pull speed [m/s] and heater power [W], the latter before it is
-    rounded to whole steps; what the process carries on; the bright ring [m], and the camera's reading of it without the
-    operator's bias [m]."""
-    return (*process.State._fields, *Inputs._fields, *process.Extra._fields, "ring", "reading")
+    rounded to whole steps; what the process carries on; the nominal drives, where they move; the bright ring [m], and
+    the camera's reading of it without the operator's bias [m]."""
+    nominal = tuple(f"{name}_nominal" for name in Inputs._fields) if process.nominal_moves else ()
+    return (*process.State._fields, *Inputs._fields, *process.Extra._fields, *nominal, "ring", "reading")
 
 
 def rows(process: Process) -> tuple[str, ...]:
@@ -137,28 +138,40 @@ def _through_drives(by: Any, J: Any, j: Any, model: Any) -> Any:
 
 
 @jittable
-def _drives_by(J: Any, slot: Any, x: Any, u: Any, action: Any, drives: Any, interval: Any, model: Any) -> None:
+def _drives_by(
+    J: Any, slot: Any, x: Any, u: Any, action: Any, before: Any, drives: Any, interval: Any, model: Any
+) -> None:
     """Derivatives of the next inputs; whole steps of the heater are taken for a power that moves freely."""
     by, process = scratch(2, model.driven_by), model.process
-    derivatives(Inputs, next_inputs, (x, u, action), (drives, slot, interval, process), by)
+    derivatives(Inputs, next_inputs, (x, u, action, before), (drives, slot, interval, process), by)
     for drive in range(2):
         for j in range(model.extra):
             J[model.states + drive, j] = by[drive, j]
         for action_of in range(ACTIONS):
             J[model.states + drive, model.smooth + action_of] = by[drive, model.extra + action_of]
+        for of in range(model.nominals):
+            J[model.states + drive, model.nominal + of] = by[drive, model.extra + ACTIONS + of]
+    if model.nominals > 0:
+        derivatives(Inputs, process.nominal, (x,), (slot, interval), by)
+        for drive in range(2):
+            for j in range(model.states):
+                J[model.nominal + drive, j] = by[drive, j]
 
 
 @jittable
 def _carried_by(J: Any, slot: Any, extra: Any, interval: Any, model: Any) -> None:
-    """Derivatives of what the process carries on, from those of the inputs."""
+    """Derivatives of what the process carries on, from those of the inputs and the nominal ones."""
     if model.extras > 0:
         by, process = scratch(model.extras, model.carried_by), model.process
-        derivatives(process.Extra, process.carry, (extra, labelled(Inputs, slot)), (slot, interval), by)
+        nominal = Inputs(slot.v_p_nominal, slot.Q_H_nominal)
+        derivatives(process.Extra, process.carry, (extra, labelled(Inputs, slot), nominal), (interval,), by)
         for j in range(model.columns):
             for row in range(model.extras):
-                total = by[row, j - model.extra] if model.extra <= j < model.ring else 0.0
+                total = by[row, j - model.extra] if model.extra <= j < model.nominal else 0.0
                 for drive in range(2):
                     total += by[row, model.extras + drive] * J[model.states + drive, j]
+                for drive in range(model.nominals):
+                    total += by[row, model.extras + 2 + drive] * J[model.nominal + drive, j]
                 J[model.extra + row, j] = total
 
 
@@ -184,15 +197,49 @@ def _cost_by(J: Any, slot: Any, t: Any, weights: Any, model: Any) -> None:
             row[j] *= slopes[term]
 
 
+@jittable
+def _nominal_of(numbers: Any, i: Any, slot: Any, model: Any) -> Any:
+    """The inputs from which actions were counted, in slot i of the differentiable states; its slot's if constant."""
+    if model.nominals > 0:
+        return column(Inputs, numbers, model.nominal, i)
+    return Inputs(slot.v_p_nominal, slot.Q_H_nominal)
+
+
+@jittable
+def _shown_by(by_state: Any, slot: Any, t: Any, per_scale: Any, model: Any) -> None:
+    """Derivatives of the "measured" channels by the differentiable state; the pyrometer's reading is of now."""
+    process, by, seen_by = model.process, scratch(model.channels, model.shown_by), scratch(4, model.states)
+    x, extra, nominal = (
+        labelled(process.State, slot.x),
+        labelled(process.Extra, slot),
+        Inputs(slot.v_p_nominal, slot.Q_H_nominal),
+    )
+    at = x, labelled(Inputs, slot), nominal, extra, labelled(Readings, slot)
+    derivatives(process.Measured, process.measure, at, (slot, t), by)
+    derivatives(Seen, process.see, (x,), (slot.puller, model.meniscus), seen_by)
+    reading = model.shown_by - 2
+    for row in range(model.channels):
+        for j in range(model.extra):
+            of = by[row, j] + (by[row, reading + 1] * seen_by[3, j] if j < model.states else 0.0)
+            by_state[row, j] = of * per_scale[row]
+        for j in range(model.extras):
+            by_state[row, model.extra + j] = by[row, model.extra + 2 + j] * per_scale[row]
+        for j in range(model.nominals):
+            by_state[row, model.nominal + j] = by[row, model.extra + j] * per_scale[row]
+        by_state[row, model.ring], by_state[row, model.ring + 1] = 0.0, by[row, reading] * per_scale[row]
+
+
 @lru_cache(maxsize=8)
-def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, Any]:
+def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, ...]:
     """Compile the loops for a process on a meniscus model.
 
-    ``gather(memory, state, start, stop)`` writes the differentiable states. ``tangents(memory, state, held,
-    actions, grows, clock, drives, work, jacobian, start, stop)`` writes the derivatives of the step that led from
-    ``state`` to where the slots are now, shape (n, rows, states + actions); zero for a slot that does not grow.
-    ``held``, shape (n, 2), is Q_d [W] and dT_i [K] before the step, which may be 5 s long: those of its first substep
-    if a point of the grid lies inside.
+    ``gather(memory, state, start, stop)`` writes the differentiable states.
+    ``shown(memory, per_scale, interval, by_state, start, stop)`` writes the derivatives of "measured" by them, shape
+    (n, channels, states).
+    ``tangents(memory, state, held, actions, grows, clock, drives, work, jacobian, start, stop)`` writes the derivatives
+    of the step that led from ``state`` to where the slots are now, shape (n, rows, states + actions); zero for a slot
+    that does not grow. ``held``, shape (n, 2), is Q_d [W] and dT_i [K] before the step, which may be 5 s long: those of
+    its first substep if a point of the grid lies inside.
     """
     model, m = model_of(process, meniscus), meniscus
 
@@ -202,8 +249,15 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, Any]
             set_column(process.State, slot.x, numbers, 0, i)
             state[i, model.states], state[i, model.states + 1] = slot.v_p, slot.Q_H_slewed
             set_column(process.Extra, slot, numbers, model.extra, i)
+            if model.nominals > 0:
+                state[i, model.nominal], state[i, model.nominal + 1] = slot.v_p_nominal, slot.Q_H_nominal
             state[i, model.ring] = process.see(labelled(process.State, slot.x), slot.puller, m).ring
             state[i, model.ring + 1] = slot.ring
+
+    def shown(memory: Any, per_scale: Any, interval: float, by_state: Any, start: int, stop: int) -> None:
+        for i in range(start, stop):
+            slot = memory.slots[i]
+            _shown_by(by_state[i], slot, slot.k * interval, per_scale, model)
 
     def tangents(
         memory: Any, state: Any, held: Any, actions: Any, grows: Any, clock: Any, drives: Any, work: Any,
@@ -218,7 +272,8 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, Any]
             slot, dt = memory.slots[i], clock.interval
             p, e = slot.puller, slot.episode
             begun, before = column(process.State, state.T, 0, i), column(Inputs, state.T, model.states, i)
-            _drives_by(J, slot, begun, before, Inputs(actions[i, 0], actions[i, 1]), drives, dt, model)
+            action, nominal = Inputs(actions[i, 0], actions[i, 1]), _nominal_of(state.T, i, slot, model)
+            _drives_by(J, slot, begun, before, action, nominal, drives, dt, model)
             _carried_by(J, slot, column(process.Extra, state.T, model.extra, i), dt, model)
             u, d = labelled(Inputs, slot), process.disturb(slot.Q_d, slot.dT_i, slot.point * GRID, e)
             point = int((slot.k - 1) * dt / GRID + _EPS)
@@ -262,4 +317,5 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, Any]
                 J[reading, reading] = 1.0
 
     keep = hashed(*process.functions, *meniscus.functions)
-    return kernel(gather, keep, allocates=False), kernel(tangents, keep, allocates=False)
+    compiled: Any = (kernel(loop, keep, allocates=False) for loop in (gather, shown, tangents))
+    return tuple(compiled)

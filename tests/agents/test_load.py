@@ -6,6 +6,7 @@ import pytest
 from cz_gym import agents
 from cz_gym.agents.agent_file.contract import read_agent
 from cz_gym.config import make_config
+from cz_gym.crystal.process import CRYSTAL
 
 SHIPPED = {"gradient": 10, "ppo": 3}
 """Training seeds of each name."""
@@ -49,3 +50,8 @@ def test_an_agent_refuses_a_config_that_it_is_not_made_for(other):
     ((name, value),) = other.items()
     with pytest.raises(agents.AgentFileError, match=f"ppo is made for {name}=.*, this config has {value!r}"):
         agents.load("ppo", make_config(**{**settings, **other}))
+
+
+def test_an_agent_of_one_environment_is_refused_by_the_other():
+    with pytest.raises(agents.AgentFileError, match=r"ppo-seed.\.onnx: trained for Cz-v0, not for CzCrystal-v0$"):
+        agents.load("ppo", make_config(process=CRYSTAL, **agents.load("ppo").settings))

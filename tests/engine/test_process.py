@@ -108,11 +108,10 @@ def accept(slot, x, new, u, d, t, dt, limit, m):
 
 
 @jittable
-def measure(slot, t):
-    p, e = slot.puller, slot.episode
-    h_ref, u = reference(t, e), nominal(slot.x, slot, 0.0)
-    T = slot.T_1 - p.T_0
-    return Read(slot.ring - p.h_0 - h_ref, slot.valid, h_ref, recipe(t, e), T, slot.v_p - u.v_p, slot.Q_H - u.Q_H)
+def measure(x, u, about, extra, readings, slot, t):
+    p, e, h_ref = slot.puller, slot.episode, reference(t, slot.episode)
+    drives = u.v_p - about.v_p, u.Q_H - about.Q_H
+    return Read(readings.ring - p.h_0 - h_ref, slot.valid, h_ref, recipe(t, e), readings.T_1 - p.T_0, *drives)
 
 
 @jittable
@@ -143,7 +142,7 @@ TANK = Process(
     logged=logged, lean=jittable(lambda slot, seen: Lean(slot.x.h, slot.puller.h_0 + seen.h_ref)), charged=charged,
     cost_terms=cost_terms, cost_slopes=cost_slopes, reward=reward, Extra=Extra,
     points=lambda p: [(Level(0.9 * p.h_0, p.T_0 + 5.0), Inputs(p.v_0, 100.0), Load(3.0))],
-    weights=WEIGHTS, carry=jittable(lambda extra, u, slot, interval: Extra(extra.fed + u.v_p * interval)), table=(3, 2),
+    weights=WEIGHTS, carry=jittable(lambda extra, u, about, dt: Extra(extra.fed + u.v_p * dt)), table=(3, 2),
 )  # fmt: skip
 # The end of the process.
 

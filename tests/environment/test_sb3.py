@@ -13,6 +13,7 @@ from cz_gym import CzEnv, CzVectorEnv
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.asymmetric import AsymmetricPolicy, AsymmetricSACPolicy, LearnState
 from cz_gym.agents.from_sb3 import save_agent
+from cz_gym.errors import CzError
 from cz_gym.sb3 import make_vec_env
 
 N = 3
@@ -216,3 +217,12 @@ def test_an_estimate_is_fitted_to_the_state_and_not_to_the_reward():
         estimator.estimate.forward = lambda _: state
         assert estimator.loss(seen).item() == 0.0
         torch.testing.assert_close(estimator(seen)[:, 13:], state)
+
+
+def test_the_environment_is_named():
+    env = make_vec_env(2, env="CzCrystal-v0", stage="tail", critic_state=True)
+    assert env.reset().shape == (2, 78 + 21)
+    assert env.get_attr("config")[0].process.name == "CzCrystal-v0"
+    env.close()
+    with pytest.raises(CzError, match="unknown environment 'CzCrystal': did you mean 'CzCrystal-v0'"):
+        make_vec_env(2, env="CzCrystal")

@@ -9,23 +9,27 @@ from cz_gym.agents.apg import APG
 from cz_gym.agents.apg.plant_step import StepCost, advance
 from cz_gym.body.cost import SCALES, WEIGHTS, saturated
 from cz_gym.config import make_config
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.differentiable import STATES, DifferentiableBatch
 from cz_gym.errors import CzError
 from cz_gym.sb3 import make_vec_env
 
 SETTINGS = {"observation": "measured", "action": "rate"}
 CONFIG = make_config(**SETTINGS)
+ALONG = {"stage": {"crown": 2, "body": 1, "tail": 1}}
+CRYSTALS = make_config(process=CRYSTAL, **ALONG, **SETTINGS)
 
 
-def algorithm(n=8, window=20, seed=0, **options):
+def algorithm(n=8, window=20, seed=0, env="Cz-v0", **options):
     torch.set_num_threads(1)
-    return APG("RecurrentPolicy", make_vec_env(n, **SETTINGS), window=window, seed=seed, **options)
+    settings = SETTINGS | (ALONG if env == "CzCrystal-v0" else {})
+    return APG("RecurrentPolicy", make_vec_env(n, env=env, **settings), window=window, seed=seed, **options)
 
 
-def some_policy(interval=5.0):
+def some_policy(env="Cz-v0"):
     """A policy with random weights, which moves both drives a little."""
     torch.manual_seed(0)
-    policy = algorithm().policy
+    policy = algorithm(env=env).policy
     with torch.no_grad():
         for parameter in policy.parameters():
             parameter.copy_(0.05 * torch.randn_like(parameter))
@@ -46,13 +50,19 @@ def driven(policy, batch, steps):
     return torch.stack(costs).mean()
 
 
-@pytest.mark.parametrize(("scenario", "apart"), [("randomized", 0.01), ("sensor-fault", 0.01), ("puller", 0.05)])
-def test_the_gradient_is_that_of_differences(scenario, apart):
+@pytest.mark.parametrize(
+    ("scenario", "apart", "config"),
+    [
+        ("randomized", 0.01, CONFIG), ("sensor-fault", 0.01, CONFIG), ("puller", 0.05, CONFIG),
+        ("randomized", 0.01, CRYSTALS),
+    ],
+)  # fmt: skip
+def test_the_gradient_is_that_of_differences(scenario, apart, config):
     """Along a random direction of all weights, through 40 steps of plant, sensors, memory and policy.
 
     The heater of ``puller`` moves in whole steps, which differences see and the gradient does not.
     """
-    policy, batch = some_policy(), DifferentiableBatch(CONFIG.with_scenario(scenario), 12)
+    policy, batch = some_policy(config.process.name), DifferentiableBatch(config.with_scenario(scenario), 12)
     driven(policy, batch, 40).backward()
     parameters = list(policy.parameters())
     directions = [torch.randn_like(parameter) for parameter in parameters]
@@ -168,7 +178,7 @@ def test_two_seeds_learn_from_other_crystals_and_one_seed_repeats():
 @pytest.mark.parametrize(
     ("env", "said"),
     [
-        (lambda: "CartPole-v1", "env must be made of Cz-v0 environments"),
+        (lambda: "CartPole-v1", "env must be made of these"),
         (lambda: make_vec_env(2, observation="history"), "reads observation=\"measured\".*not 'history'"),
     ],
 )

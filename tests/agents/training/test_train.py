@@ -11,19 +11,24 @@ from dataclasses import replace
 import pytest
 import torch
 
-from cz_gym.agents import OnnxPolicy
+from cz_gym.agents import AgentFileError, OnnxPolicy, load
 from cz_gym.agents.training import run
 from cz_gym.agents.training.checkpoint import load_checkpoint
-from cz_gym.agents.training.recipes import RECIPES
+from cz_gym.agents.training.recipes import CRYSTAL_RECIPES, RECIPES
 from cz_gym.commands import train
+from cz_gym.config import make_config
 from cz_gym.support.command_line import interpreter
 from tests.small_learners import QUICK
+
+ALONG = {name: getattr(CRYSTAL_RECIPES["ppo"], name) for name in ("environment", "stages", "scenario")}
 
 
 @pytest.fixture
 def quick(monkeypatch, few_crystals):
     monkeypatch.setitem(RECIPES, "ppo", QUICK)
-    monkeypatch.setitem(RECIPES, "gradient", replace(RECIPES["gradient"], num_envs=64, window=12))
+    monkeypatch.setitem(CRYSTAL_RECIPES, "ppo", replace(QUICK, **ALONG))
+    for recipes in (RECIPES, CRYSTAL_RECIPES):
+        monkeypatch.setitem(recipes, "gradient", replace(recipes["gradient"], num_envs=64, window=12))
 
 
 def rows(path):
@@ -71,6 +76,25 @@ def ctrl_c():
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("algorithm", CRYSTAL_RECIPES)
+def test_a_run_on_whole_crystals_goes_on_and_its_agent_is_for_these(algorithm, tmp_path, capsys):
+    folder = tmp_path / "run"
+    assert train.main(["--env", "CzCrystal-v0", "--algo", algorithm, "--steps", "6000", "--out", str(folder)]) == 0
+    assert "on CzCrystal-v0 (crown, body, tail), randomized, into" in capsys.readouterr().out
+    contract = OnnxPolicy.load(folder / "agent.onnx").contract
+    assert (contract.environment, contract.algorithm) == ("CzCrystal-v0", algorithm)
+    before = rows(folder / "progress.csv")
+    assert list(before[-1])[-2:] == ["compensated_rmse_mm", "lqg-along_rmse_mm"]
+    assert train.main(["--resume", "--steps", "12000", "--out", str(folder)]) == 0
+    assert rows(folder / "progress.csv")[: len(before)] == before
+    with pytest.raises(AgentFileError, match=r"agent.onnx: trained for CzCrystal-v0, not for Cz-v0$"):
+        load(folder / "agent.onnx", make_config())
+    assert train.main(["--env", "Cz-v0", "--resume", "--out", str(folder)]) == 2
+    assert "the run was begun with another settings" in capsys.readouterr().err
+
+
 @pytest.mark.usefixtures("quick", "ctrl_c")
 @pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
 def test_ctrl_c_in_the_middle_of_an_update_saves_after_it(tmp_path, monkeypatch, capsys):
@@ -105,6 +129,7 @@ def test_ctrl_c_in_the_middle_of_an_update_saves_after_it(tmp_path, monkeypatch,
         (["--scenario", "hard=much"], "'hard=much' is no scenario with its share"),
         (["--scenario", "none.py:quiet"], "none.py: no such file"),
         (["--resume"], "nothing to resume"),
+        (["--env", "CzCrystal-v0", "--algo", "sac"], "'sac' is no recipe here: name one of ppo, gradient by --algo"),
     ],
 )
 def test_a_wrong_command_is_refused_in_one_line(tmp_path, arguments, message, refused):
