@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from numbers import Integral, Real
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -133,7 +134,8 @@ class Config:
     def reward_hash(self) -> str:
         """SHA-256 of the reward: its weights, and what it computes at some points (16 hex digits)."""
         process, numbers = self.process, list[float](self.weights)
-        carried = process.carry(process.Extra(*[1.0] * len(process.Extra._fields)), Inputs(2.0, 3.0), None, 60.0)
+        extra, slot = process.Extra(*[1.0] * len(process.Extra._fields)), SimpleNamespace(v_p_nominal=0.0)
+        carried = process.carry(extra, Inputs(2.0, 3.0), slot, 60.0)
         for size in (10.0**power for power in range(-6, 5)):
             terms = process.cost_terms(process.Cost(*[size] * len(process.Cost._fields)), self.weights)
             numbers += [*terms, process.reward(terms, True), process.reward(terms, False)]

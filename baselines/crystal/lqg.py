@@ -1,8 +1,8 @@
 """A linear quadratic Gaussian regulator of a whole crystal: Kalman filter and regulator at each length of the recipe.
 
 Both are solved for the linearisation at some lengths, as if the crystal stayed there, and interpolated between. The
-model has half conduction and half convection, and three states that are not the plant's: the interface's slow
-fluctuation, a heat load on the melt, and the error of the recipe's temperature. SI units.
+model has three states that are not the plant's: the interface's slow fluctuation, the drift of the hot zone, which
+the recipe that is given follows, and the error of that recipe. SI units.
 """
 
 from dataclasses import dataclass, field
@@ -21,8 +21,8 @@ from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN
 
 PLANT, EXOGENOUS, DRIVES = 5, 3, 2
 STATES = PLANT + EXOGENOUS
-"""r_c, h_c, T_1, T_2, T_b, then the fluctuation [K], the load [W] and the recipe's error [K]."""
-_SIZES = np.array([MM, MM, *[1.0] * 4, KILO, 1.0, MM_PER_MIN, KILO])
+"""r_c, h_c, T_1, T_2, T_b, then the fluctuation, the drift and the recipe's error [K]."""
+_SIZES = np.array([MM, MM, *[1.0] * 6, MM_PER_MIN, KILO])
 """Sizes of the states and the drives, in SI units."""
 
 
@@ -41,12 +41,12 @@ class Noise(NamedTuple):
     """Standard deviation of the interface's fluctuation [K]."""
     tau: float = 400.0
     """Correlation time of the interface's fluctuation [s]."""
-    load: float = 300.0
-    """Standard deviation of the heat load on the melt [W]."""
+    drift: float = 3.0
+    """Standard deviation of the drift of the hot zone [K]."""
     recipe: float = 4.0
     """Standard deviation of the recipe's error [K]."""
     slow: float = 2.0 * HOUR
-    """Correlation time of load and recipe's error [s]."""
+    """Correlation time of drift and recipe's error [s]."""
 
 
 class Weights(NamedTuple):
@@ -77,23 +77,23 @@ class Gains(NamedTuple):
 def design(parameters: Any, meniscus: MeniscusModel, dt: float, lam: float, noise: Noise, weights: Weights) -> Gains:
     """Design filter and regulator for a control interval [s]."""
     at = along(parameters, meniscus, lam)
-    designs = [_at(A, B, C, dt, noise, weights) for A, B, C in zip(at.A, at.B, at.C, strict=True)]
+    designs = [_at(A, B, C, at.load, dt, noise, weights) for A, B, C in zip(at.A, at.B, at.C, strict=True)]
     return Gains(at.L, *(np.stack(each) for each in zip(*designs, strict=True)))
 
 
-def _at(A: Floats, B: Floats, C: Floats, dt: float, noise: Noise, weights: Weights) -> tuple[Floats, ...]:
+def _at(A: Floats, B: Floats, C: Floats, load: float, dt: float, noise: Noise, weights: Weights) -> tuple[Floats, ...]:
     """A, B and C in discrete time, K and F at one length."""
     rates = 1.0 / np.array([noise.tau, noise.slow, noise.slow])
     whole = np.zeros((STATES + DRIVES, STATES + DRIVES))
     whole[:PLANT, :PLANT], whole[:PLANT, STATES:] = A, B[:, :DRIVES]
-    whole[:PLANT, PLANT], whole[:PLANT, PLANT + 1] = B[:, 3], B[:, 2]
+    whole[:PLANT, PLANT], whole[:PLANT, PLANT + 1] = B[:, 3], load * B[:, 2]
     whole[PLANT:STATES, PLANT:STATES] = -np.diag(rates)
     moved = expm(whole * dt)
     F_d, B_d = moved[:STATES, :STATES], moved[:STATES, STATES:]
     seen = np.zeros((2, STATES))
-    seen[0, :PLANT], seen[1, 2], seen[1, STATES - 1] = C, 1.0, -1.0
+    seen[0, :PLANT], seen[1, 2], seen[1, PLANT + 1 :] = C, 1.0, -1.0
     walks = np.array([1e-9, noise.height, *[noise.temperature] * 3])
-    sizes = np.array([noise.fluctuation, noise.load, noise.recipe])
+    sizes = np.array([noise.fluctuation, noise.drift, noise.recipe])
     Q = np.diag([*walks**2 * dt, *sizes**2 * (1.0 - np.exp(-2.0 * rates * dt))])
     R = np.diag([noise.ring**2, noise.pyrometer**2])
     P = _solve(F_d.T, seen.T, Q, R, 1.0 / _SIZES[:STATES], 1.0 / np.array([MM, 1.0]))
