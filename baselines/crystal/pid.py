@@ -25,6 +25,15 @@ BLEND = 40.0 * MM
 """Length of body over which the gain changes after the crown and before the tail [m]."""
 
 
+def in_cones(factor: float, L: Floats, q: Any) -> Floats:
+    """A factor at a length: 1 in the body, ``factor`` in the cones; it changes within :data:`BLEND` of the body, as a
+    jump would kick the pull.
+    """
+    ends = q.crown_length + q.body_length
+    at = q.crown_length, q.crown_length + BLEND, ends - BLEND, ends
+    return np.interp(L, at, (factor, 1.0, 1.0, factor))
+
+
 class Memory(NamedTuple):
     """The memory of :class:`CrystalPID`; each of shape (n,)."""
 
@@ -72,13 +81,6 @@ class CrystalPID(MeasuredController):
         """The linearisation along the recipe."""
         return along(self.parameters, self.meniscus, self.lam)
 
-    def gain(self, L: Floats) -> Floats:
-        """Gain of the error at a length: it changes within :data:`BLEND` of the body, as a jump would kick the pull."""
-        q: Any = self.parameters
-        ends = q.crown_length + q.body_length
-        at = q.crown_length, q.crown_length + BLEND, ends - BLEND, ends
-        return np.interp(L, at, (self.cone_gain, 1.0, 1.0, self.cone_gain))
-
     def at_rest(self, seen: Any) -> Memory:
         """The applied pull speed and power continue."""
         zero = np.zeros_like(seen.v_p)
@@ -96,7 +98,7 @@ class CrystalPID(MeasuredController):
         filtered = memory.filtered + pace * (error - memory.filtered)
         missed = (seen.v_p - memory.command) / self.pid.K_p
         tracking = memory.pid.integral + min(dt / self.T_track, 1.0) * missed
-        gain = self.gain(seen.L)
+        gain = in_cones(self.cone_gain, seen.L, self.parameters)
         pull, pid = self.pid.step(gain * filtered, memory.pid._replace(integral=tracking), dt)
         power, heat = self.heater.step(seen, memory.heat, dt, self.v_0, self.heater_range)
         return pull, power, Memory(height, filtered, pid, pull, heat)

@@ -51,19 +51,16 @@ LOOP = (
 )
 COMPENSATOR = (Parameter("lam", 0.0, 1.0, log=False), Parameter("slow", 1e-5, 1e-2))
 DESIGN = (
-    Parameter("lam", 0.0, 1.0, log=False),
     Parameter("noise.ring", 0.01 * MM, 0.5 * MM),
-    Parameter("noise.height", 1e-7, 1e-3),
-    Parameter("noise.temperature", 1e-5, 0.1),
+    Parameter("noise.height", 1e-6, 1e-3),
+    Parameter("noise.cones", 0.3, 10.0),
     Parameter("noise.fluctuation", 0.02, 4.0),
-    Parameter("noise.tau", 30.0, HOUR),
     Parameter("noise.drift", 0.1, 30.0),
     Parameter("noise.recipe", 0.1, 30.0),
     Parameter("noise.slow", 0.2 * HOUR, 20.0 * HOUR),
     Parameter("weights.height", 0.03 * MM, 3.0 * MM),
     Parameter("weights.pull", 0.01 * MM_PER_MIN, 3.0 * MM_PER_MIN),
     Parameter("weights.pull_step", 0.006 * MM_PER_MIN, 0.6 * MM_PER_MIN),
-    Parameter("weights.power", 0.4 * KILO, 40.0 * KILO),
     Parameter("weights.power_step", 0.1 * KILO, 10.0 * KILO),
 )
 
@@ -150,9 +147,8 @@ CRYSTALS = (
         name="lqg-along",
         meaning="Kalman filter and regulator designed along the recipe",
         start=CrystalLQG(
-            lam=0.1,
-            noise=Noise(height=1.0e-5, temperature=1.0e-3),
-            weights=Weights(radius=0.4 * MM, height=0.3 * MM, pull=0.1 * MM_PER_MIN),
+            noise=Noise(height=1.5e-5, cones=1.4, temperature=2e-3, fluctuation=0.3, tau=600.0, drift=5.0),
+            weights=Weights(radius=0.4 * MM, height=0.3 * MM, pull=0.1 * MM_PER_MIN, power_step=1.6 * KILO),
         ),
         parameters=DESIGN,
         quoted=True,

@@ -74,9 +74,9 @@ class Record:
         return self.column("r_c") - self.column("r_ref")
 
     @property
-    def nominal(self) -> tuple[float, float]:
-        """Nominal pull speed [m/s] and heater power [W] now."""
-        return self.puller.v_0, self.puller.Q_H_0
+    def nominal(self) -> tuple[float, float, float]:
+        """Nominal pull speed [m/s], heater power [W] and melt temperature [K] now."""
+        return self.puller.v_0, self.puller.Q_H_0, self.puller.T_b_0
 
     @property
     def ring_bias(self) -> Any:
@@ -136,15 +136,19 @@ class CrystalRecord(Record):
         self._table = np.array(slot["table"])
 
     @property
-    def nominal(self) -> tuple[float, float]:
-        """The recipe's pull speed [m/s] and heater power [W] now."""
-        return self.last("v_p_ref"), self.last("Q_H_ref")
+    def nominal(self) -> tuple[float, float, float]:
+        """The recipe's pull speed [m/s], heater power [W] and melt temperature [K] now."""
+        return self.last("v_p_ref"), self.last("Q_H_ref"), float(self._recipe(recipe._T_b)[-1])
 
     @property
     def ring_bias(self) -> Any:
         """The recipe's ring less its radius at each sample [m]."""
+        return self._recipe(recipe._ring)
+
+    def _recipe(self, column: int) -> Floats:
+        """A column of the recipe at each sample's length."""
         place = self.column("L") / recipe.spacing(self.puller) + recipe.MARGIN
-        return np.interp(place, np.arange(recipe.ROWS), self._table[:, recipe._ring])
+        return np.interp(place, np.arange(recipe.ROWS), self._table[:, column])
 
     @property
     def lowest(self) -> float:

@@ -65,9 +65,9 @@ def _draw_header(canvas: Canvas, record: Record) -> None:
     hours, rest = divmod(round(float(record.t[-1])), round(HOUR))
     minutes, seconds = divmod(rest, round(MINUTE))
     canvas.text(10, 7, record.environment, size=14, bold=True)
-    canvas.text(14 + 10 * len(record.environment), 10, record.scenario, palette.FAINT, 11)
+    canvas.text(14 + 9 * len(record.environment), 10, record.scenario, palette.FAINT, 11)
     time, grown = f"{hours}:{minutes:02d}:{seconds:02d}", f"{record.length[-1] / MM:.1f} mm"
-    for x, name, value in ((200, "time", time), (312, "grown", grown)):
+    for x, name, value in ((204, "time", time), (312, "grown", grown)):
         canvas.text(x, 10, name, palette.FAINT, 11)
         canvas.text(x + 42, 7.5, value, size=13, bold=True)
     status, colour = ("growing", palette.WELL) if record.ending is None else ("ended", palette.ALARM)
@@ -82,14 +82,14 @@ Row = tuple[str, str, Colour]
 
 def numbers(record: Record) -> list[list[Row]]:
     """The rows of a record's newest sample; the first of each group is a signal, those below it its references."""
-    p, last, (v_p, Q_H) = record.puller, record.last, record.nominal
+    last, (v_p, Q_H, T_b) = record.last, record.nominal
     return [
         [_row("by the camera", record.camera_error[-1] + last("r_ref"), MM, "mm", palette.CAMERA),
          _row("reference", last("r_ref"), MM, "mm", palette.REFERENCE)],
         [_row("pull speed", last("v_p"), MM_PER_MIN, "mm/min", palette.DRIVE), _row("nominal", v_p, MM_PER_MIN)],
         [_row("heater", last("Q_H"), KILO, "kW", palette.DRIVE), _row("nominal", Q_H, KILO)],
         [_row("heater T_1", last("T_1"), 1.0, "K", palette.TEMPERATURE), _row("recipe", last("T_1_ref"))],
-        [_row("melt T_b", last("T_b"), 1.0, "K", palette.TEMPERATURE), _row("nominal", p.T_b_0)],
+        [_row("melt T_b", last("T_b"), 1.0, "K", palette.TEMPERATURE), _row("nominal", T_b)],
     ]  # fmt: skip
 
 

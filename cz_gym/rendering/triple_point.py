@@ -17,8 +17,9 @@ from .record import CrystalRecord, Ending, Floats, Record
 
 INSIDE = 11.0 * MM
 """Distance that the panel shows inside r_0, at least [m]; crystals are lost at 8 mm."""
-WIDER, LEAST_WIDTH = 1.35, 14.0 * MM
-"""Width of a whole crystal's panel in largest radii, and the least radius that counts [-, m]."""
+WIDER, LEAST_WIDTH, DEEP = 1.45, 14.0 * MM, 0.2
+"""Width of a whole crystal's panel in largest radii [-], the least radius that counts [m], and the melt's share of the
+panel's height [-]."""
 BELOW, ABOVE = 9.0 * MM, 24.0 * MM
 """Heights that it shows below the melt's surface, and above it at least [m]."""
 POINTS = 48
@@ -54,7 +55,7 @@ def scale_of(box: Box, record: Record) -> Scale:
     """
     if isinstance(record, CrystalRecord):
         per_metre = box.w / (WIDER * max(record.column("r_ref").max(), LEAST_WIDTH))
-        return Scale(box.x, box.bottom - max(BELOW * per_metre, 24.0), per_metre)
+        return Scale(box.x, box.bottom - DEEP * box.h, per_metre)
     across = 2.0 * INSIDE + record.puller.ring_bias
     per_metre = min(box.w / across, box.h / (BELOW + ABOVE))
     axis = box.x + 0.5 * box.w - (record.puller.r_0 + 0.5 * record.puller.ring_bias) * per_metre
