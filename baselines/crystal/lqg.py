@@ -108,7 +108,7 @@ def _at(A: Floats, B: Floats, C: Floats, load: float, dt: float, noise: Noise, w
     Q = np.diag([*walks**2 * dt, *sizes**2 * (1.0 - np.exp(-2.0 * rates * dt))])
     R = np.diag([noise.ring**2, noise.pyrometer**2])
     P = _solve(F_d.T, seen.T, Q, R, 1.0 / _SIZES[:STATES], 1.0 / np.array([MM, 1.0]))
-    S = np.linalg.inv(seen @ P @ seen.T + R)
+    S: Floats = np.asarray(np.linalg.inv(seen @ P @ seen.T + R), np.float64)
     return F_d, B_d, seen, P @ seen.T @ S, _regulator(F_d, B_d, weights), S
 
 
@@ -154,7 +154,7 @@ class CrystalLQG(MeasuredController):
 
     process: ClassVar[Process] = CRYSTAL
 
-    models: tuple[float, ...] = (0.05, 0.35, 0.9)
+    models: tuple[float, ...] = (0.0, 0.1, 0.35, 0.9)
     """Shares of conduction that it considers possible [-]."""
     forgets: float = 2.0 * HOUR
     """Time after which a model's mistakes are forgotten [s]."""

@@ -67,7 +67,8 @@ def along(parameters: Any, meniscus: MeniscusModel, lam: float = 1.0) -> Along:
     lengths = np.linspace(0.0, end(p), _POINTS)
     points = [_at(float(L), table, p, meniscus) for L in lengths]
     load = float(hidden_load(0.5, p) - hidden_load(-0.5, p))
-    return Along(lengths, *(np.stack(each) for each in zip(*points, strict=True)), load)
+    A, B, C = (np.stack(each) for each in zip(*points, strict=True))
+    return Along(lengths, A, B, C, load)
 
 
 def _at(L: float, table: Floats, p: Any, m: MeniscusModel) -> tuple[Floats, Floats, Floats]:

@@ -133,7 +133,7 @@ def _most(values: Floats, where: npt.NDArray[np.bool_]) -> Floats:
     return np.where(where.any(axis=0), most, np.nan)
 
 
-def _share(values: npt.NDArray[np.generic], weights: npt.NDArray[np.generic]) -> Floats:
+def _share(values: npt.NDArray[Any], weights: npt.NDArray[Any]) -> Floats:
     """Mean of each episode with these weights, shape (steps, episodes); NaN where they are all zero."""
     total = weights.sum(axis=0, dtype=np.float64)
     kept = np.where(weights > 0, values, 0.0)  # a signal after a loss may be anything

@@ -148,7 +148,8 @@ class CrystalRecord(Record):
     def _recipe(self, column: int) -> Floats:
         """A column of the recipe at each sample's length."""
         place = self.column("L") / recipe.spacing(self.puller) + recipe.MARGIN
-        return np.interp(place, np.arange(recipe.ROWS), self._table[:, column])
+        values: Floats = np.interp(place, np.arange(recipe.ROWS), self._table[:, column])
+        return values
 
     @property
     def lowest(self) -> float:

@@ -117,7 +117,7 @@ def test_stages_of_whole_crystals_have_the_same_report_with_metrics_of_their_own
     assert data["provenance"]["parameters"]["heater_max"] is None
     assert report.startswith("recipe loses the fewest crystals, ")
     assert "| ring-pid | 3 frozen | - | - |" in report
-    assert "| controller | lost of crown / tail-puller [%] | crown's largest error [mm] |" in report
+    assert "| controller | lost of crown / tail-puller [%] | 95 % of crowns [mm] | body within 0.5 mm [%] |" in report
 
 
 def test_whole_crystals_are_quoted_in_two_pages(crystals, tmp_path, monkeypatch):

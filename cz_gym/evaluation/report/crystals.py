@@ -34,8 +34,11 @@ DRIVES = (
     HOURS, ENERGY, Column("dopant_spread", "dopant's spread [%]", 1, PERCENT), PULL_STEP, HEATER_STEP, RMSE,
     Column("cost", "cost", 4), RETURN, Column(SPEED, "compute [us/step]", 2),
 )  # fmt: skip
-SHORT = tuple(column._replace(interval=False) for column in (*ERROR, HOURS, ENERGY, PULL_STEP))
-_OVERVIEW = ((CROWN, 0), (CROWN_95, 0), (BODY, 1), (V_OVER_G, 1), (TAIL_95, 2), (ENERGY, 1))
+SHORT = tuple(
+    column._replace(interval=False)
+    for column in (FAILURES, CROWN, CROWN_95, BODY, V_OVER_G, TAIL_95, HOURS, ENERGY, PULL_STEP)
+)
+_OVERVIEW = ((CROWN_95, 0), (BODY, 1), (V_OVER_G, 1), (TAIL_95, 2), (ENERGY, 1))
 """Columns of the overview, with the part of the crystal whose row they are taken from."""
 
 
@@ -130,13 +133,16 @@ def draw(result: Result) -> bytes:
         axis.set(aspect="equal", xlim=(-room, room), ylim=ends[::-1])
     profiles[0].set_ylabel("length [mm]")
     profiles[len(samples) // 2].set_xlabel("radius [mm]")
-    for axis, panel in zip(below.subplots(len(_PANELS), 1, sharex=True), _PANELS, strict=True):
+    axes: Any = below.subplots(len(_PANELS), 1, sharex=True)
+    for axis, panel in zip(axes, _PANELS, strict=True):
         for sample in samples:
             s = signals[sample.name]
             axis.plot(s.L / MM, panel.value(s), color=style[sample.name].colour, lw=0.9)
         if panel.reference:
             axis.plot(longest.L / MM, panel.reference(longest), color=INK, lw=0.8, ls="--")
-        limits = np.concatenate([panel.value(signals[each.name]) for each in samples if not lost(each)] or [[0.0, 1.0]])
+        limits = np.concatenate(
+            [panel.value(signals[each.name]) for each in samples if not lost(each)] or [np.arange(2.0)]
+        )
         low, high = np.quantile(limits, (0.001, 0.999))
         axis.set(xlim=ends, ylim=(low - 0.1 * (high - low), high + 0.1 * (high - low)))
         axis.set_ylabel(panel.label.replace(" [", "\n["))

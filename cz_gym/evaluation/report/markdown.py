@@ -16,6 +16,7 @@ from . import grower
 from .canvas import COLUMNS, chosen
 from .contents import contents_of
 from .tables import (
+    NOTHING,
     RMSE,
     WHO,
     Column,
@@ -191,6 +192,7 @@ def terminal(results: Sequence[Result]) -> str:
 def _short(result: Result) -> str:
     row, columns = result.row, contents_of(result.row).short
     grown_on = f", on {row.grown_on}" if row.file or row.puller != DEFAULT else ""
+    columns = tuple(each for each in columns if any(cell != NOTHING for _, cell in rows(result, [each])))
     heads: Sequence[str] = ["controller", *(column.heading for column in columns)]
     lines = rows(result, columns)
     if row.tolerance is not None:

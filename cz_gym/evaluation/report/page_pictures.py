@@ -10,7 +10,6 @@ from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
 from cz_gym.body.cost import TOLERANCE
-from cz_gym.body.signals import Logged
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.env import CzEnv
 from cz_gym.evaluation.protocol import Row
@@ -96,7 +95,7 @@ class Panel(NamedTuple):
     unit: str
     scale: float
     """Size of the unit in SI units."""
-    lines: Mapping[str, Callable[[Logged, float], Floats]]
+    lines: Mapping[str, Callable[[Any, float], Floats]]
     """Lines by name, each a function of an episode's signals and the operator's bias [m], in SI units. "true" and
     "camera" (its reading) are drawn for each controller; other lines are the same for all and drawn once."""
     levels: tuple[float, ...] = ()
@@ -134,7 +133,7 @@ _RECIPES: dict[str, Callable[[Any, float], Floats]] = {
 CRYSTAL_PANELS = (
     PANELS[0]._replace(lines={"true": PANELS[0].lines["true"]}),
     PANELS[1]._replace(levels=()),
-    *(each._replace(lines=each.lines | {"recipe": line} if (line := _RECIPES.get(each.title)) else each.lines)
+    *(each._replace(lines={**each.lines, "recipe": line} if (line := _RECIPES.get(each.title)) else each.lines)
       for each in PANELS[2:]),
     Panel("v/G by the recipe's", "1", 1.0, {"true": lambda s, bias: s.v_over_G}, (1.0,)),
 )  # fmt: skip
@@ -170,8 +169,8 @@ def _draw(
 ) -> dict[str, Any]:
     """Add the lines of a scenario and return the ranges of its panels: those of the crystals that were not lost."""
     samples, interval = chosen(result.samples, COLUMNS), result.row.control_interval
-    whole = result.row.process is CRYSTAL
-    bias = 0.0 if whole else ring_bias(result.row, result.seeds[0])
+    by_length = result.row.process is CRYSTAL
+    bias = 0.0 if by_length else ring_bias(result.row, result.seeds[0])
     step = max(round(POINT / interval), 1)
     time = {"x0": 0.5 * step * interval / MINUTE, "dx": step * interval / MINUTE}
     longest = max(map(example, samples), key=lambda signals: len(signals.r_c))
@@ -184,7 +183,7 @@ def _draw(
                 own = name in OWN
                 signals = example(sample) if own else longest
                 values = _points(function(signals, bias) / panel.scale, step)
-                places = {"x": _points(signals.L / MM, step)[: len(values)]} if whole else time
+                places = {"x": _points(signals.L / MM, step)[: len(values)]} if by_length else time
                 look = {"name": plain(sample.name) if own else name, "showlegend": False}
                 if own and not number and name == "true":
                     rmse = f"{sample.metric('rmse_mm')[0, 0]:.3f} mm{', lost' if lost(sample) else ''}"

@@ -8,7 +8,7 @@ import pytest
 
 from cz_gym.baselines.lqg.controller import LQGDesign
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.tuning.crystal import CRYSTALS, STAGES, CrystalFigures, priced
+from cz_gym.baselines.tuning.crystal import CRYSTALS, SCENARIOS, STAGES, CrystalFigures, priced
 from cz_gym.baselines.tuning.lqg import ACTIVITIES, BEST_RETURN, FAMILY, LQGS, PARAMETERS, lqg_goal
 from cz_gym.baselines.tuning.pid import PIDS, pid_goal
 from cz_gym.baselines.tuning.record import Figures, Parameter, value_at
@@ -216,7 +216,7 @@ def test_shipped_settings_are_those_a_search_chose(tuned, scenario):
 @pytest.mark.parametrize("tuned", CRYSTALS, ids=name)
 def test_controllers_of_whole_crystals_have_what_a_search_chose(tuned):
     found = kept(tuned.name, "randomized")
-    config = make_config("randomized", process=CRYSTAL, stage=STAGES, **PLAIN)
+    config = make_config(SCENARIOS, process=CRYSTAL, stage=STAGES, **PLAIN)
     search = Search(tuned.name, tuned.goal, config, 1, 5)
     chosen = found["chosen"]["values"]
     assert list(chosen) == [parameter.path for parameter in search.goal.parameters]
@@ -264,6 +264,7 @@ def test_the_command_writes_what_the_search_chose(name, kind, trials, scenario, 
     [
         (["--controller", "nobody"], "unknown controller to tune 'nobody'"),
         (["--controller", "industrial", "--scenario", "moon"], "moon"),
+        (["--controller", "lqg-along", "--scenario", "hard"], "lqg-along has one search: leave --scenario hard out"),
         (["--controller", "lqg", "--scenario", "hard"], "lqg has no goal on 'hard', but on randomized"),
     ],
 )
