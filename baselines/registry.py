@@ -5,10 +5,10 @@ from functools import partial
 
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.bounds.lqg import full_information, privileged
-from cz_gym.baselines.crystal.tuned import COMPENSATED_PID, LQG_ALONG, REDUCED_PID, RING_PID, TRUE_PID
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.mpc import ekf_mpc
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
+from cz_gym.baselines.tuning.crystal import CRYSTALS, RING_PID, TRUE_PID
 from cz_gym.baselines.tuning.lqg import BEST_RETURN, FILTER, LQGS, TunedLQG, adaptive
 from cz_gym.baselines.tuning.pid import PIDS, paper_here
 from cz_gym.body.process import BODY
@@ -99,19 +99,18 @@ CONTROLLERS: tuple[Contender, ...] = (
 )
 """Every named controller of ``Cz-v0``, in the order of tables."""
 CRYSTAL_CONTROLLERS: tuple[Contender, ...] = (
-    _measured("recipe", partial(unchanged, OpenLoop()), meaning="the recipe's pull speed and power, no feedback"),
-    _measured("ring-pid", RING_PID.for_config, meaning="PID on the bright ring with the body's gains"),
-    _measured("ring-pid-reduced", REDUCED_PID.for_config, meaning="the same with smaller gains in crown and tail"),
-    _measured(
-        "compensated",
-        COMPENSATED_PID.for_config,
-        meaning="PID on the ring less the height that the paper's compensator predicts along the recipe",
-        quoted=True,
+    Contender("recipe", partial(unchanged, OpenLoop()), "measured", "the recipe's pull speed and power, no feedback"),
+    Contender("ring-pid", RING_PID.for_config, "measured", "PID on the bright ring with the body's gains"),
+    *(each.contender for each in CRYSTALS),
+    Contender(
+        "true-radius",
+        TRUE_PID.for_config,
+        "state",
+        "bound: the PID on the true radius, which no sensor shows",
+        privileged=True,
     ),
-    _measured("lqg-along", LQG_ALONG.for_config, meaning="Kalman filter and regulator designed along the recipe"),
-    _bound("true-radius", TRUE_PID.for_config, "state", "bound: the PID on the true radius, which no sensor shows"),
 )
-"""Every named controller of ``CzCrystal-v0``, tuned by hand."""
+"""Every named controller of ``CzCrystal-v0``, in the order of tables."""
 
 
 def find_controller(name: str, process: Process = BODY) -> Contender:

@@ -13,7 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.body.process import BODY
 from cz_gym.config import Config, make_config
+from cz_gym.crystal.parameters import STAGES
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.env import CzEnv
 from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
@@ -26,7 +29,7 @@ from cz_gym.support.units import MINUTE
 
 Action = npt.NDArray[np.float32]
 CONTROLLERS = "cz_gym.baselines.registry:find_controller"
-"""Function that finds the paper's controller, looked up by name because this package imports no controller."""
+"""Function that finds a controller, looked up by name because this package imports no controller."""
 SIZE = (960, 720)
 """Width and height of the picture [px]."""
 NO_DISPLAY = "no display: a crystal is pulled by hand in a window; set DISPLAY or WAYLAND_DISPLAY"
@@ -40,14 +43,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Play one crystal; 0 when done, 2 for bad input or without a window, 130 when interrupted."""
     parser = OneLineParser(
         "cz-gym play",
-        "Pull a crystal by hand in a window; the score compares you with the paper's controller on the same crystal.",
+        "Pull a crystal by hand in a window; the score compares you with a controller on the same crystal.",
         "Keys: up and down change the pull speed, right and left the heater, ten times as fast with shift; Esc ends.",
     )
     add = parser.add_argument
     add("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
     add("--seed", type=between(0, 2**31 - 1), default=1, metavar="N", help="which crystal (%(default)s)")
     add("--speed", type=between(5, 300), default=60, metavar="N", help="times faster than real time (%(default)s)")
-    add("--minutes", type=between(1, 6000), default=180, metavar="M", help="length of the run (%(default)s)")
+    add(
+        "--minutes",
+        type=between(1, 6000),
+        metavar="M",
+        help="length of the run (180; of a stage 1.3 times its recipe's)",
+    )
+    add("--stage", metavar="STAGE", help=f"part of a whole crystal, CzCrystal-v0: {', '.join(STAGES)}")
     parser.add_puller("pull its crystals")
     return parser.run(_play, arguments, "render")
 
@@ -63,26 +72,32 @@ def keys() -> dict[tuple[int, ...], Action]:
 
 
 def score(config: Config, seed: int, actions: Sequence[Action], failed: bool) -> str:
-    """RMSE and return of a player's actions, and those of the paper's controller on the same crystal, in one line.
+    """RMSE and return of a player's actions, and those of a controller on the same crystal, in one line.
+
+    It is the paper's, and on a whole crystal its compensator along the recipe.
 
     A run that the player left early ends there for both. A failed one counts to the horizon, as in the benchmark.
     """
     if not failed:
         config = replace(config, horizon=len(actions) * config.control_interval)
     direct = replace(config, action="direct")
-    paper = pkgutil.resolve_name(CONTROLLERS)("paper").make(direct)
+    name, whose = ("compensated", "the compensated") if config.process is CRYSTAL else ("paper", "the paper's")
+    rival = pkgutil.resolve_name(CONTROLLERS)(name, config.process).make(direct)
     results = []
-    for policy, own in ((Playback(actions), config), (paper, direct)):
+    for policy, own in ((Playback(actions), config), (rival, direct)):
         found = metrics(rollout(policy, own, [seed]))
         lost = ", failed" if found.failure_rate[0] else ""
         results.append(f"RMSE {found.rmse_mm[0]:.3f} mm, return {found.return_[0]:,.0f}{lost}")
     crystal = f"{config.scenario.name}, crystal {seed}, {config.horizon / MINUTE:.0f} min"
-    return f"{crystal}: by hand {results[0]}; by the paper's controller {results[1]}"
+    return f"{crystal}: by hand {results[0]}; by {whose} controller {results[1]}"
 
 
 def _play(arguments: argparse.Namespace) -> None:
-    length, puller, pygame = arguments.minutes * MINUTE, chosen_puller(arguments.puller), load()
-    config = make_config(arguments.scenario, None, "measured", horizon=length, action="rate", puller=puller)
+    puller, pygame, stage = chosen_puller(arguments.puller), load(), arguments.stage
+    config = make_config(
+        arguments.scenario, None, "measured", horizon=arguments.minutes and arguments.minutes * MINUTE, action="rate",
+        puller=puller, process=CRYSTAL if stage else BODY, stage=stage,
+    )  # fmt: skip
     if sys.platform.startswith(("linux", "freebsd")) and not any(map(os.environ.get, DISPLAYS)):
         raise CzError(NO_DISPLAY)
     pygame.display.init()
@@ -94,10 +109,12 @@ def _play(arguments: argparse.Namespace) -> None:
     actions: list[Action] = []
     ended = failed = False
 
-    def watch(before: Any, after: Any, action: Action, reward: Any, terminated: bool, truncated: bool, _: Any) -> None:
+    def watch(
+        before: Any, after: Any, action: Action, reward: Any, terminated: bool, truncated: bool, info: Any
+    ) -> None:
         nonlocal ended, failed
         actions.append(action)
-        ended, failed = terminated or truncated, terminated
+        ended, failed = terminated or truncated, terminated and not info.get("succeeded", 0.0)
         if ended:
             pygame.event.post(pygame.event.Event(pygame.QUIT))
 

@@ -1,10 +1,11 @@
 """A linear quadratic Gaussian regulator of a whole crystal: Kalman filter and regulator at each length of the recipe.
 
 Both are solved for the linearisation at some lengths, as if the crystal stayed there, and interpolated between. The
-model has half conduction and half convection, and three states that are not the plant's: the interface's slow
-fluctuation, a heat load on the melt, and the error of the recipe's temperature. SI units.
+model has three states that are not the plant's: the interface's slow fluctuation, the drift of the hot zone, which
+the recipe that is given follows, and the error of that recipe. SI units.
 """
 
+import math
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, ClassVar, NamedTuple
@@ -19,10 +20,12 @@ from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.process import Process
 from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN
 
+from .pid import in_cones
+
 PLANT, EXOGENOUS, DRIVES = 5, 3, 2
 STATES = PLANT + EXOGENOUS
-"""r_c, h_c, T_1, T_2, T_b, then the fluctuation [K], the load [W] and the recipe's error [K]."""
-_SIZES = np.array([MM, MM, *[1.0] * 4, KILO, 1.0, MM_PER_MIN, KILO])
+"""r_c, h_c, T_1, T_2, T_b, then the fluctuation, the drift and the recipe's error [K]."""
+_SIZES = np.array([MM, MM, *[1.0] * 6, MM_PER_MIN, KILO])
 """Sizes of the states and the drives, in SI units."""
 
 
@@ -34,19 +37,21 @@ class Noise(NamedTuple):
     pyrometer: float = 0.1
     """Noise of the pyrometer [K]."""
     height: float = 2.0e-7
-    """Walk of the height, for what the model lacks [m/sqrt(s)]."""
+    """Walk of the height in the body, for what the model lacks [m/sqrt(s)]."""
+    cones: float = 1.0
+    """The same in crown and tail, in multiples of the body's [-]."""
     temperature: float = 3.0e-3
     """Walk of each temperature [K/sqrt(s)]."""
     fluctuation: float = 0.4
     """Standard deviation of the interface's fluctuation [K]."""
     tau: float = 400.0
     """Correlation time of the interface's fluctuation [s]."""
-    load: float = 300.0
-    """Standard deviation of the heat load on the melt [W]."""
+    drift: float = 3.0
+    """Standard deviation of the drift of the hot zone [K]."""
     recipe: float = 4.0
     """Standard deviation of the recipe's error [K]."""
     slow: float = 2.0 * HOUR
-    """Correlation time of load and recipe's error [s]."""
+    """Correlation time of drift and recipe's error [s]."""
 
 
 class Weights(NamedTuple):
@@ -71,34 +76,40 @@ class Gains(NamedTuple):
     """From innovations to states."""
     F: Floats
     """From states and last drives to drives."""
+    S: Floats
+    """Inverse of the innovations' covariance."""
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=12)
 def design(parameters: Any, meniscus: MeniscusModel, dt: float, lam: float, noise: Noise, weights: Weights) -> Gains:
     """Design filter and regulator for a control interval [s]."""
     at = along(parameters, meniscus, lam)
-    designs = [_at(A, B, C, dt, noise, weights) for A, B, C in zip(at.A, at.B, at.C, strict=True)]
+    walks = noise.height * in_cones(noise.cones, at.L, parameters)
+    designs = [
+        _at(A, B, C, at.load, dt, noise._replace(height=float(walk)), weights)
+        for A, B, C, walk in zip(at.A, at.B, at.C, walks, strict=True)
+    ]
     return Gains(at.L, *(np.stack(each) for each in zip(*designs, strict=True)))
 
 
-def _at(A: Floats, B: Floats, C: Floats, dt: float, noise: Noise, weights: Weights) -> tuple[Floats, ...]:
+def _at(A: Floats, B: Floats, C: Floats, load: float, dt: float, noise: Noise, weights: Weights) -> tuple[Floats, ...]:
     """A, B and C in discrete time, K and F at one length."""
     rates = 1.0 / np.array([noise.tau, noise.slow, noise.slow])
     whole = np.zeros((STATES + DRIVES, STATES + DRIVES))
     whole[:PLANT, :PLANT], whole[:PLANT, STATES:] = A, B[:, :DRIVES]
-    whole[:PLANT, PLANT], whole[:PLANT, PLANT + 1] = B[:, 3], B[:, 2]
+    whole[:PLANT, PLANT], whole[:PLANT, PLANT + 1] = B[:, 3], load * B[:, 2]
     whole[PLANT:STATES, PLANT:STATES] = -np.diag(rates)
     moved = expm(whole * dt)
     F_d, B_d = moved[:STATES, :STATES], moved[:STATES, STATES:]
     seen = np.zeros((2, STATES))
-    seen[0, :PLANT], seen[1, 2], seen[1, STATES - 1] = C, 1.0, -1.0
+    seen[0, :PLANT], seen[1, 2], seen[1, PLANT + 1 :] = C, 1.0, -1.0
     walks = np.array([1e-9, noise.height, *[noise.temperature] * 3])
-    sizes = np.array([noise.fluctuation, noise.load, noise.recipe])
+    sizes = np.array([noise.fluctuation, noise.drift, noise.recipe])
     Q = np.diag([*walks**2 * dt, *sizes**2 * (1.0 - np.exp(-2.0 * rates * dt))])
     R = np.diag([noise.ring**2, noise.pyrometer**2])
     P = _solve(F_d.T, seen.T, Q, R, 1.0 / _SIZES[:STATES], 1.0 / np.array([MM, 1.0]))
-    K = P @ seen.T @ np.linalg.inv(seen @ P @ seen.T + R)
-    return F_d, B_d, seen, K, _regulator(F_d, B_d, weights)
+    S: Floats = np.asarray(np.linalg.inv(seen @ P @ seen.T + R), np.float64)
+    return F_d, B_d, seen, P @ seen.T @ S, _regulator(F_d, B_d, weights), S
 
 
 def _regulator(A: Floats, B: Floats, weights: Weights) -> Floats:
@@ -129,40 +140,54 @@ class Memory(NamedTuple):
     """The memory of :class:`CrystalLQG`."""
 
     x: Floats
-    """Estimated states, shape (n, 8)."""
+    """Estimated states by each model, shape (n, models, 8)."""
+    evidence: Floats
+    """Logarithm of how well each model has predicted, the best one's zero, shape (n, models)."""
 
 
 @dataclass(frozen=True)
 class CrystalLQG(MeasuredController):
-    """The regulator on the filter's estimate; what the camera does not see is not corrected while it is blind."""
+    """Filters and regulators for several shares of conduction, the drives weighted by how well each filter predicts.
+
+    What the camera does not see is not corrected while it is blind.
+    """
 
     process: ClassVar[Process] = CRYSTAL
 
-    lam: float = 0.5
-    """Share of conduction in its model [-]."""
+    models: tuple[float, ...] = (0.0, 0.1, 0.35, 0.9)
+    """Shares of conduction that it considers possible [-]."""
+    forgets: float = 2.0 * HOUR
+    """Time after which a model's mistakes are forgotten [s]."""
     noise: Noise = field(default_factory=Noise)
     weights: Weights = field(default_factory=Weights)
     jump: float = 1.0 * MM
     """Largest innovation of the ring that counts [m]."""
 
     def at_rest(self, seen: Any) -> Memory:
-        """On the recipe, as far as the first sample tells."""
-        x = np.zeros((len(seen.L), STATES))
-        x[:, STATES - 1] = seen.T_1_ref - seen.T_1
-        return Memory(x)
+        """On the recipe, as far as the first sample tells; no model is better than the others."""
+        x = np.zeros((len(seen.L), len(self.models), STATES))
+        x[:, :, STATES - 1] = (seen.T_1_ref - seen.T_1)[:, None]
+        return Memory(x, np.zeros(x.shape[:2]))
 
     def step(self, seen: Any, memory: Memory) -> tuple[Floats, Floats, Memory]:
         """Pull speed and heater power above the recipe's, and the new memory."""
-        at = design(self.parameters, self.meniscus, self.control_interval, self.lam, self.noise, self.weights)
-        u = np.stack([seen.v_p, seen.Q_H], axis=1)
-        near, share = _between(at.L, seen.L)
-        A, B, C, K, F = (_mix(each, near, share) for each in at[1:])
-        x = _times(A, memory.x) + _times(B, u)
-        told = np.stack([seen.ring_error, seen.T_1 - seen.T_1_ref], axis=1) - _times(C, x)
-        told[:, 0] = np.where(seen.valid > 0.5, np.clip(told[:, 0], -self.jump, self.jump), 0.0)
-        x = x + _times(K, told)
-        drives = _times(F, np.concatenate([x, u], axis=1))
-        return drives[:, 0], drives[:, 1], Memory(x)
+        u, told = np.stack([seen.v_p, seen.Q_H], axis=1), np.stack([seen.ring_error, seen.T_1 - seen.T_1_ref], axis=1)
+        states, drives = np.empty_like(memory.x), np.empty((*memory.x.shape[:2], DRIVES))
+        evidence = memory.evidence * math.exp(-self.control_interval / self.forgets)
+        for number, lam in enumerate(self.models):
+            at = design(self.parameters, self.meniscus, self.control_interval, lam, self.noise, self.weights)
+            near, share = _between(at.L, seen.L)
+            A, B, C, K, F, S = (_mix(each, near, share) for each in at[1:])
+            x = _times(A, memory.x[:, number]) + _times(B, u)
+            new = told - _times(C, x)
+            new[:, 0] = np.where(seen.valid > 0.5, np.clip(new[:, 0], -self.jump, self.jump), 0.0)
+            evidence[:, number] += 0.5 * (np.log(np.linalg.det(S)) - np.sum(new * _times(S, new), axis=1))
+            states[:, number] = x + _times(K, new)
+            drives[:, number] = _times(F, np.concatenate([states[:, number], u], axis=1))
+        evidence -= evidence.max(axis=1, keepdims=True)
+        weights = np.exp(evidence)[:, :, None]
+        acts = (weights * drives).sum(axis=1) / weights.sum(axis=1)
+        return acts[:, 0], acts[:, 1], Memory(states, evidence)
 
 
 def _between(L: Floats, at: Floats) -> tuple[Any, Floats]:

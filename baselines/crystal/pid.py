@@ -25,6 +25,15 @@ BLEND = 40.0 * MM
 """Length of body over which the gain changes after the crown and before the tail [m]."""
 
 
+def in_cones(factor: float, L: Floats, q: Any) -> Floats:
+    """A factor at a length: 1 in the body, ``factor`` in the cones; it changes within :data:`BLEND` of the body, as a
+    jump would kick the pull.
+    """
+    ends = q.crown_length + q.body_length
+    at = q.crown_length, q.crown_length + BLEND, ends - BLEND, ends
+    return np.interp(L, at, (factor, 1.0, 1.0, factor))
+
+
 class Memory(NamedTuple):
     """The memory of :class:`CrystalPID`; each of shape (n,)."""
 
@@ -36,6 +45,8 @@ class Memory(NamedTuple):
     command: Floats
     """Last commanded pull speed above the recipe's [m/s]."""
     heat: Heat
+    start: Floats
+    """What the pyrometer showed above the recipe at the first sample [K]."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +54,8 @@ class CrystalPID(MeasuredController):
     """v_p = recipe + K F (gain e), e the ring's error, less c_h(L) dh if it compensates.
 
     dh' = v_p - recipe - (a_h(L) + slow) dh, F = 1/(1 + T_f s); gain is 1 in the body, ``cone_gain`` in crown and tail.
-    The integrator follows the applied pull speed within ``T_track``.
+    The integrator follows the applied pull speed within ``T_track``. The recipe's temperature is shifted to what the
+    pyrometer shows at the start, as an operator does: the crystal grows there.
     """
 
     process: ClassVar[Process] = CRYSTAL
@@ -72,18 +84,11 @@ class CrystalPID(MeasuredController):
         """The linearisation along the recipe."""
         return along(self.parameters, self.meniscus, self.lam)
 
-    def gain(self, L: Floats) -> Floats:
-        """Gain of the error at a length: it changes within :data:`BLEND` of the body, as a jump would kick the pull."""
-        q: Any = self.parameters
-        ends = q.crown_length + q.body_length
-        at = q.crown_length, q.crown_length + BLEND, ends - BLEND, ends
-        return np.interp(L, at, (self.cone_gain, 1.0, 1.0, self.cone_gain))
-
     def at_rest(self, seen: Any) -> Memory:
         """The applied pull speed and power continue."""
         zero = np.zeros_like(seen.v_p)
         pid = PIDState(zero, zero, seen.v_p / self.pid.K_p)
-        return Memory(zero, zero, pid, seen.v_p, self.heater.at_rest(seen))
+        return Memory(zero, zero, pid, seen.v_p, self.heater.at_rest(seen), seen.T_1 - seen.T_1_ref)
 
     def step(self, seen: Any, memory: Memory) -> tuple[Floats, Floats, Memory]:
         """Pull speed and heater power above the recipe's, and the new memory."""
@@ -96,10 +101,11 @@ class CrystalPID(MeasuredController):
         filtered = memory.filtered + pace * (error - memory.filtered)
         missed = (seen.v_p - memory.command) / self.pid.K_p
         tracking = memory.pid.integral + min(dt / self.T_track, 1.0) * missed
-        gain = self.gain(seen.L)
+        gain = in_cones(self.cone_gain, seen.L, self.parameters)
         pull, pid = self.pid.step(gain * filtered, memory.pid._replace(integral=tracking), dt)
-        power, heat = self.heater.step(seen, memory.heat, dt, self.v_0, self.heater_range)
-        return pull, power, Memory(height, filtered, pid, pull, heat)
+        shifted = seen._replace(T_1_ref=seen.T_1_ref + memory.start)
+        power, heat = self.heater.step(shifted, memory.heat, dt, self.v_0, self.heater_range)
+        return pull, power, Memory(height, filtered, pid, pull, heat, memory.start)
 
 
 @dataclass(frozen=True)

@@ -83,19 +83,21 @@ class Goal:
     parameters: tuple[Parameter, ...]
     survive: tuple[str, ...]
     """Scenarios that only have to be survived."""
-    objective: Callable[[Figures], float]
+    objective: Callable[[Any], float]
     """Score within the limits, failures included; a search minimises it."""
     limits: tuple[Limit, ...]
     failure_price: float
     """Cost of losing every crystal."""
     miss_price: float
     """Price of a negative distance."""
+    kind: type[Any] = Figures
+    """Type of the figures that candidates are judged by."""
 
     def policy(self, settings: Any, config: Config) -> Any:
         """The controller with these settings, which are an LQG's design or a controller, for an environment."""
         return (LQG(design=settings) if isinstance(settings, LQGDesign) else settings).for_config(config)
 
-    def cost(self, figures: Figures, policy: Any) -> float:
+    def cost(self, figures: Any, policy: Any) -> float:
         """The objective plus the price of missed limits: the score of the figures on the scenario itself."""
         missed = sum(max(0.0, -limit(figures, policy)) for limit in self.limits)
         return self.objective(figures) + self.miss_price * missed

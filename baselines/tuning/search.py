@@ -47,7 +47,7 @@ class Trial(NamedTuple):
     """Figures behind the score."""
 
 
-Measure = Callable[[Any, Config, Sequence[int]], Figures]
+Measure = Callable[[Any, Config, Sequence[int]], Any]
 
 
 def measure(policy: Any, config: Config, seeds: Sequence[int]) -> Figures:
@@ -101,10 +101,10 @@ class Search:
 
         goal = self.goal
 
-        def tried(point: Floats) -> tuple[tuple[float, ...], Figures]:
+        def tried(point: Floats) -> tuple[tuple[float, ...], Any]:
             values = tuple(p.value(x) for p, x in zip(goal.parameters, point, strict=True))
             known = {trial.values: trial for trial in self.trials}
-            return values, Figures(**(known.get(values) or self.add(values)).facts["figures"])
+            return values, goal.kind(**(known.get(values) or self.add(values)).facts["figures"])
 
         def objective(point: Floats) -> float:
             return goal.objective(tried(point)[1])

@@ -8,11 +8,12 @@ from pathlib import Path
 
 from cz_gym.agents import OnnxPolicy, shipped_names, shipped_seeds
 from cz_gym.baselines import registry
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.errors import CzError
 from cz_gym.evaluation import user_code
 from cz_gym.evaluation.contender import Contender, agent
 from cz_gym.evaluation.files import check_targets, write
-from cz_gym.evaluation.protocol import ROWS, SLOW_EPISODES, Row, find_row
+from cz_gym.evaluation.protocol import CRYSTAL_ROWS, ENVIRONMENTS, SLOW_EPISODES, Row, find_row
 from cz_gym.evaluation.report.markdown import terminal
 from cz_gym.evaluation.runner import check_agents, is_cached, run
 from cz_gym.machine.puller import chosen_puller
@@ -24,8 +25,10 @@ CLONE = Path(__file__).resolve().parents[2]
 RESULTS = CLONE / "results" if (CLONE / "results" / "benchmark").is_dir() else Path("runs")
 """Folder of the committed results in a clone, of a user's results elsewhere."""
 FOLDER = RESULTS / "benchmark"
-README = CLONE / "README.md"
-"""Page of a clone that quotes the committed results between two markers."""
+CRYSTALS = RESULTS / "crystal"
+"""The same of whole crystals."""
+README, CRYSTAL_PAGE = CLONE / "README.md", CLONE / "docs" / "crystal.md"
+"""Pages of a clone that quote the committed results between two markers."""
 OWN = Path("runs")
 """Folder of results with the user's own controllers, agents or scenarios, each in a folder of their names."""
 CACHE = RESULTS / "cache"
@@ -43,6 +46,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         epilog="docs/benchmark.md has the protocol, the formula of every metric and how to add a controller.",
     )
     add = parser.add_argument
+    about = "environment (%(default)s); of a whole crystal the scenarios are its stages"
+    add("--env", choices=ENVIRONMENTS, default="Cz-v0", help=about)
     about = "first N test episodes (%(default)s)"
     add("--episodes", type=between(1, EPISODES), default=EPISODES, metavar="N", help=about)
     add("--controllers", type=_names, metavar="A,B", help='controllers and agents by name, or "all"')
@@ -88,9 +93,24 @@ def main(argv: Sequence[str]) -> int:
         mine = [place.rpartition(":")[2] for place in (*arguments.controller, *arguments.scenario)]
         mine += [name or file.stem for name, file in arguments.agent]
         mine += [Path(arguments.puller).stem] if arguments.puller else []
-        arguments.out = OWN / "-".join(dict.fromkeys(mine)) if mine else FOLDER
+        arguments.out = OWN / "-".join(dict.fromkeys(mine)) if mine else folder_of(arguments)
     command = shlex.join(["cz-gym", "benchmark", *argv])
     return guarded("cz-gym benchmark", lambda: benchmark(arguments, command), "benchmark")
+
+
+def folder_of(arguments: argparse.Namespace) -> Path:
+    """Folder of the committed results of an environment."""
+    return CRYSTALS if arguments.env == "CzCrystal-v0" else FOLDER
+
+
+def registered(arguments: argparse.Namespace) -> tuple[Contender, ...]:
+    """The controllers of an environment."""
+    return registry.CRYSTAL_CONTROLLERS if arguments.env == "CzCrystal-v0" else registry.CONTROLLERS
+
+
+def shipped_agents(arguments: argparse.Namespace) -> list[str]:
+    """The shipped agents of an environment."""
+    return [] if arguments.env == "CzCrystal-v0" else shipped_names()
 
 
 def benchmark(arguments: argparse.Namespace, command: str) -> int:
@@ -102,13 +122,14 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     if arguments.out is not None:  # a missing package is named before the work, not after it
         import matplotlib  # noqa: F401
         import plotly  # noqa: F401
-    bounds = None if arguments.puller else BOUNDS
+    bounds = None if arguments.puller or rows[0].process is CRYSTAL else BOUNDS
     results = run(contenders, rows, arguments.episodes, CACHE, bounds, arguments.quiet, arguments.cluster)
-    quoted = README if not smaller and arguments.out and arguments.out.resolve() == FOLDER else None
+    renewed = not smaller and arguments.out and arguments.out.resolve() == folder_of(arguments)
+    quoted = (README, CRYSTAL_PAGE) if renewed else ()
     write(arguments.out, arguments.json, results, command, quoted)
     if not arguments.quiet:
         print(terminal(results))
-        slow = {each.name for each in registry.CONTROLLERS if each.slow} - {each.name for each in contenders}
+        slow = {each.name for each in registered(arguments) if each.slow} - {each.name for each in contenders}
         if arguments.controllers == ["all"] and slow:
             names = ", ".join(sorted(slow))
             print(f"left out of all: {names}, which are slow and not cached for every episode; add --slow to run them")
@@ -119,14 +140,16 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
 
 def rows_of(arguments: argparse.Namespace) -> list[Row]:
     """Scenarios that the command line asks for, as rows of the protocol."""
-    if arguments.tolerance is not None and not (arguments.puller and 0.0 < arguments.tolerance <= 50.0):
-        raise CzError(f"--tolerance {arguments.tolerance:g} must be up to 50 mm, beside --puller FILE.toml")
-    names = arguments.scenarios or [row.name for row in ROWS if row.default and not arguments.scenario]
-    rows = [*map(find_row, names), *map(user_code.row, arguments.scenario)]
+    known = ENVIRONMENTS[arguments.env]
+    graded = arguments.puller and known is not CRYSTAL_ROWS
+    if arguments.tolerance is not None and not (graded and 0.0 < arguments.tolerance <= 50.0):
+        raise CzError(f"--tolerance {arguments.tolerance:g} must be up to 50 mm, beside --puller FILE.toml, of Cz-v0")
+    names = arguments.scenarios or [row.name for row in known if row.default and not arguments.scenario]
+    rows = [*(find_row(name, known) for name in names), *map(user_code.row, arguments.scenario)]
     user_code.check_apart([row.name for row in rows], "scenario")
     puller = chosen_puller(arguments.puller)
-    tolerance = 0.5 * MM * (arguments.tolerance or 1.0) if arguments.puller else None
-    return [replace(row, puller=puller, tolerance=tolerance) for row in rows]
+    tolerance = 0.5 * MM * (arguments.tolerance or 1.0) if graded else None
+    return [replace(row, puller=puller, tolerance=tolerance, process=known[0].process) for row in rows]
 
 
 def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Contender]:
@@ -136,27 +159,28 @@ def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Co
     ``--slow`` asks for them, or if they are named and all their episodes cached.
     """
     own, given = [user_code.controller(place) for place in arguments.controller], given_agents(arguments)
-    registered, shipped = [each.name for each in registry.CONTROLLERS], shipped_names()
+    controllers, shipped = registered(arguments), shipped_agents(arguments)
+    names = [each.name for each in controllers]
     new = [name for name in given if name not in shipped]
-    user_code.check_apart([*registered, *shipped, *new, *(each.name for each in own)], "controller")
+    user_code.check_apart([*names, *shipped, *new, *(each.name for each in own)], "controller")
 
     def may_run(each: Contender) -> bool:
         return not each.slow or arguments.slow or is_cached(each, rows, arguments.episodes, CACHE)
 
     wanted, agents = arguments.controllers, list(given) or ([] if arguments.puller else shipped)
     if not wanted and arguments.puller:
-        wanted = [each.name for each in registry.CONTROLLERS if each.on_puller] + agents
+        wanted = [each.name for each in controllers if each.on_puller] + agents
     elif not wanted and own and not arguments.slow:
-        wanted = [each.name for each in registry.CONTROLLERS if each.quoted]
+        wanted = [each.name for each in controllers if each.quoted]
     elif not wanted:
-        usual = [each for each in registry.CONTROLLERS if (arguments.slow if each.slow else each.default)]
+        usual = [each for each in controllers if (arguments.slow if each.slow else each.default)]
         wanted = [each.name for each in usual] + agents
     elif wanted == ["all"]:
-        wanted = [each.name for each in registry.CONTROLLERS if may_run(each)] + agents
+        wanted = [each.name for each in controllers if may_run(each)] + agents
     for name in wanted:
-        if name not in (known := [*registered, *new, *shipped]):
+        if name not in (known := [*names, *new, *shipped]):
             raise CzError(unknown("controller", name, known, ", or all"))
-    chosen = [each for each in registry.CONTROLLERS if each.name in wanted]
+    chosen = [each for each in controllers if each.name in wanted]
     for each in chosen:
         if not may_run(each):
             raise CzError(f"{each.name!r} is slow: add --slow to run it on the first {SLOW_EPISODES} episodes")
@@ -179,7 +203,9 @@ def given_agents(arguments: argparse.Namespace) -> dict[str, Contender]:
 
 def is_partial(arguments: argparse.Namespace, contenders: Sequence[Contender], rows: Sequence[Row]) -> bool:
     """Whether the run holds less than the default one, or something of the user's own."""
-    usual = {each.name for each in registry.CONTROLLERS if each.default and not each.slow} | set(shipped_names())
-    missing = usual - {each.name for each in contenders} or {row for row in ROWS if row.default} - set(rows)
+    usual = {each.name for each in registered(arguments) if each.default and not each.slow}
+    usual |= set(shipped_agents(arguments))
+    usual_rows = {row for row in ENVIRONMENTS[arguments.env] if row.default}
+    missing = usual - {each.name for each in contenders} or usual_rows - set(rows)
     own = arguments.agent or arguments.controller or arguments.scenario or arguments.puller
     return bool(arguments.episodes < EPISODES or missing or own)

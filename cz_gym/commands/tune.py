@@ -9,20 +9,24 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from cz_gym.baselines.tuning import crystal
+from cz_gym.baselines.tuning.crystal import CRYSTALS, SCENARIOS, STAGES, TunedCrystal
 from cz_gym.baselines.tuning.lqg import LQGS
 from cz_gym.baselines.tuning.pid import PIDS
 from cz_gym.baselines.tuning.record import Tuned
 from cz_gym.baselines.tuning.search import Search, Trial, measure
 from cz_gym.baselines.tuning.values import file_name, folder_of
 from cz_gym.config import Config, make_config
-from cz_gym.episodes.scenarios import find_scenario
+from cz_gym.crystal.process import CRYSTAL
+from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.errors import CzError
 from cz_gym.evaluation.processes import side_by_side
 from cz_gym.machine.puller import PullerFile, chosen_puller
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.names import unknown
 
-TUNABLE = {each.name: each for each in (*PIDS, *LQGS)}
+_ALL: tuple[Tuned | TunedCrystal, ...] = (*PIDS, *LQGS, *CRYSTALS)
+TUNABLE = {each.name: each for each in _ALL}
 Task = tuple[Tuned, PullerFile, int, int, Path]
 """A search for a puller: controller, puller, candidates, episodes and folder."""
 
@@ -53,9 +57,15 @@ def _tune(given: argparse.Namespace) -> None:
     scenario, tuned = find_scenario(given.scenario), TUNABLE.get(given.controller)
     if tuned is None:
         raise CzError(unknown("controller to tune", given.controller, TUNABLE))
-    goal, crystals = tuned.goal(scenario), tuned.crystals(scenario)
-    config = make_config(crystals, None, "measured", given.control_interval, action="direct")
-    search = Search(tuned.name, goal, config, given.trials or 100, given.episodes or 100, measure)
+    trials, episodes, interval = given.trials or 100, given.episodes or 100, given.control_interval
+    if isinstance(tuned, TunedCrystal):
+        if scenario != RANDOMIZED:
+            raise CzError(f"{tuned.name} has one search: leave --scenario {given.scenario} out")
+        config = make_config(SCENARIOS, None, "measured", interval, action="direct", process=CRYSTAL, stage=STAGES)
+        search = Search(tuned.name, tuned.goal, config, trials, episodes, crystal.measure)
+    else:
+        config = make_config(tuned.crystals(scenario), None, "measured", interval, action="direct")
+        search = Search(tuned.name, tuned.goal(scenario), config, trials, episodes, measure)
     chosen = search.tune((given.out or Path("runs/tuning")) / file_name(tuned.name, given.scenario))
     print(f"{tuned.name} on {given.scenario}: {chosen.score:.4f} {chosen.facts}")
     print(search.settings(chosen.values))

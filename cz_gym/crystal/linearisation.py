@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.body.plant import hidden_load
 from cz_gym.episodes.record import Episode
 from cz_gym.physics.linearisation import linearise
 from cz_gym.physics.meniscus import MeniscusModel
@@ -39,6 +40,8 @@ class Along(NamedTuple):
     """Shape (points, 5, 4)."""
     C: Floats
     """The bright ring by the states, shape (points, 5)."""
+    load: float
+    """Heat load on the melt that comes with a kelvin of drift, which the recipe that is given follows [W/K]."""
 
     @property
     def a_h(self) -> Floats:
@@ -63,7 +66,9 @@ def along(parameters: Any, meniscus: MeniscusModel, lam: float = 1.0) -> Along:
     p, table = nominal_recipe(parameters._replace(**dict.fromkeys(APART, 0.0)), meniscus, lam)
     lengths = np.linspace(0.0, end(p), _POINTS)
     points = [_at(float(L), table, p, meniscus) for L in lengths]
-    return Along(lengths, *(np.stack(each) for each in zip(*points, strict=True)))
+    load = float(hidden_load(0.5, p) - hidden_load(-0.5, p))
+    A, B, C = (np.stack(each) for each in zip(*points, strict=True))
+    return Along(lengths, A, B, C, load)
 
 
 def _at(L: float, table: Floats, p: Any, m: MeniscusModel) -> tuple[Floats, Floats, Floats]:

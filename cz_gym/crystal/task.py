@@ -123,6 +123,23 @@ def within_limits(x: Any, r_ref: Any, limit: Any, p: Any) -> Any:
     return radius & meniscus & (x.T_b >= p.T_m)
 
 
+WAYS = ("frozen", "detached", "off", "cold")
+"""Ways to lose a crystal: meniscus too low, meniscus too high, radius too far off, melt below its melting point."""
+
+
+def room(at: Any, limit: Any, q: Any) -> Any:
+    """Relative distance of logged signals to the limit of each of :data:`WAYS`; the least one says how it was lost.
+
+    After an impossible jump the state is the one before, which is still within all limits. ``limit`` is the largest
+    radius error of the body [m], q the parameters.
+    """
+    a = (2.0 * q.sigma / (q.rho_l * q.g)) ** 0.5
+    body_ends = q.crown_length + q.body_length
+    cone = np.where((q.crown_length <= at.L) & (body_ends >= at.L), 1.0, CONE_LIMIT)
+    radius = np.minimum(1.0 - np.abs(at.r_c - at.r_ref) / (limit * cone), at.r_c / (LEAST_RADIUS * q.r_start) - 1.0)
+    return (at.h_c - HEIGHT_MIN) / _LOW, (HEIGHT_MAX_IN_A * a - at.h_c) / a, radius, at.T_b - q.T_m
+
+
 @jittable
 def accept(slot: Any, x: Any, new: Any, u: Any, d: Any, t: Any, dt: Any, limit: Any, m: Any) -> Any:
     """The state after a substep and whether the crystal grows on, is lost, or long enough.

@@ -18,7 +18,6 @@ import numpy.typing as npt
 from cz_gym.errors import CzError
 from cz_gym.support.atomic_files import check_writable, naming, write_files
 
-from .metrics import metric_names
 from .protocol import contract_hash
 from .results import BOUND, REFERENCE, Result
 from .statistics import RESAMPLES, SEED, Estimate
@@ -52,9 +51,9 @@ def check_targets(folder: Path | None, lone: Path | None, partial: bool, overwri
 
 
 def write(
-    folder: Path | None, lone: Path | None, results: Sequence[Result], command: str, quoted: Path | None = None
+    folder: Path | None, lone: Path | None, results: Sequence[Result], command: str, quoted: Sequence[Path] = ()
 ) -> None:
-    """Write the files, ``benchmark.json`` last, and the table into the page ``quoted``, if it exists."""
+    """Write the files, ``benchmark.json`` last, and the table into the pages ``quoted`` that exist."""
     text = to_json(results, command).encode()
     files: dict[Path, bytes] = {}
     if folder:
@@ -67,10 +66,10 @@ def write(
         files[folder / EPISODES] = to_csv(results).encode()
         files[folder / "report.md"] = markdown(results, command, figures).encode()
         files[folder / "report.html"] = page(results, command).encode()
-        if quoted and quoted.is_file():
-            with naming(quoted):
-                before = quoted.read_text("utf-8")
-            files[quoted] = fill_in(before, results).encode()
+        for each in filter(Path.is_file, quoted):
+            with naming(each):
+                before = each.read_text("utf-8")
+            files[each] = fill_in(before, results).encode()
         files[folder / RESULTS] = text
     if lone:
         files[lone] = text
@@ -87,6 +86,7 @@ def to_json(results: Sequence[Result], command: str) -> str:
         "results": each(lambda result: result.means),
         "paired": each(_paired),
         "cvar5": each(lambda result: result.cvar5),
+        "largest": each(lambda result: result.largest),
         "optimality_gap": _gaps(results, "cost"),
         "optimality_gap_radius": _gaps(results, "rmse_mm"),
         "verdicts": {
@@ -136,7 +136,9 @@ def _provenance(results: Sequence[Result], command: str) -> dict[str, Any]:
         "contract": contract_hash([result.row for result in results]),
         "plant_hash": config.plant_hash,
         "puller": config.puller.label,
-        "parameters": config.parameters._asdict(),
+        "parameters": {
+            name: value if math.isfinite(value) else None for name, value in config.parameters._asdict().items()
+        },
         "control_interval_s": config.control_interval,
         "horizon_s": config.horizon,
         "scenarios": {result.row.name: _crystals(result) for result in results},
@@ -181,7 +183,7 @@ def to_csv(results: Sequence[Result]) -> str:
         for training_seed, episodes in zip(sample.contender.training_seeds or ("",), sample.values, strict=True)
         for seed, values in zip(sample.seeds, episodes, strict=True)
     )
-    text, heads = io.StringIO(), ("scenario", "controller", "training_seed", "seed", *metric_names())
+    text, heads = io.StringIO(), ("scenario", "controller", "training_seed", "seed", *results[0].samples[0].names)
     csv.writer(text, lineterminator="\n").writerows([heads, *rows])
     return text.getvalue()
 

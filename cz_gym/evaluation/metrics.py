@@ -1,7 +1,7 @@
 """The benchmark's metrics on the true radius, one value an episode, from logged signals; ``return`` alone is reward."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -54,7 +54,7 @@ class Metrics(NamedTuple):
     """Mean over the steps of the reward's cost before it saturates, which the clairvoyant bound minimises [-]."""
     failure_rate: Floats
     """1 if the episode failed, else 0 [-]."""
-    # ``return`` is not a Python name; metric_names() restores it.
+    # ``return`` is not a Python name; names_of() restores it.
     return_: Floats
     """Sum of rewards; each step that a lost crystal has left of its horizon counts as the worst one, 1 - 10 [-].
 
@@ -63,9 +63,14 @@ class Metrics(NamedTuple):
     """
 
 
+def names_of(kind: Any) -> tuple[str, ...]:
+    """Return the names of metrics, a type with a field each, as files and tables have them."""
+    return tuple(name.rstrip("_") for name in kind._fields)
+
+
 def metric_names() -> tuple[str, ...]:
-    """Return the names of the metrics as files and tables have them."""
-    return tuple(name.rstrip("_") for name in Metrics._fields)
+    """Return the names of ``Cz-v0``'s metrics."""
+    return names_of(Metrics)
 
 
 def metrics(run: Rollout) -> Metrics:

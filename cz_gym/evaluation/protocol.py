@@ -8,6 +8,8 @@ from typing import Any
 from cz_gym.body.cost import PULL_TOLERANCE, TOLERANCE
 from cz_gym.body.process import BODY
 from cz_gym.config import Config, make_config
+from cz_gym.crystal.parameters import STAGES
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import ALIASES, find_scenario
 from cz_gym.errors import CzError
@@ -56,6 +58,8 @@ class Row:
     """What is simulated."""
     stage: Any = None
     """Part of the crystal that is grown, where the process has stages."""
+    most: int = len(TEST_SEEDS)
+    """Largest number of its crystals."""
 
     @property
     def control_interval(self) -> float:
@@ -84,7 +88,7 @@ class Row:
 
     def seeds(self, episodes: int) -> range:
         """Return the seeds of the first ``episodes`` crystals, of one if the scenario is deterministic."""
-        number = 1 if find_scenario(self.scenario).deterministic else episodes
+        number = 1 if find_scenario(self.scenario).deterministic else min(episodes, self.most)
         return range(self.first_seed, self.first_seed + number)
 
 
@@ -134,20 +138,45 @@ ROWS: tuple[Row, ...] = (
 """Every row, in the order of tables; families of disturbances alone and variants of randomized run when asked for."""
 
 
-def find_row(name: str) -> Row:
+_GROWN = {
+    "crown": "from the neck to 60 mm of body",
+    "body": "three hours from a drawn length of the body on",
+    "tail": "from 50 mm before the tail to its end",
+    "whole": "from the neck to the tail's end",
+}
+CRYSTAL_ROWS: tuple[Row, ...] = tuple(
+    Row(
+        stage if scenario == "randomized" else f"{stage}-{scenario}",
+        scenario,
+        f"{_GROWN[stage]}, {scenario}",
+        default=scenario == "randomized" and stage != "whole",
+        process=CRYSTAL,
+        stage=stage,
+        most=SLOW_EPISODES if stage == "whole" else len(TEST_SEEDS),
+    )
+    for scenario in ("randomized", "hard", "sensor-fault", "puller", "hot-zone", "nominal")
+    for stage in STAGES
+)
+"""Every row of ``CzCrystal-v0``: a stage under a scenario's disturbances; those on randomized have the stage's name."""
+ENVIRONMENTS: dict[str, tuple[Row, ...]] = {"Cz-v0": ROWS, "CzCrystal-v0": CRYSTAL_ROWS}
+"""The rows of each environment."""
+
+
+def find_row(name: str, rows: Sequence[Row] = ROWS) -> Row:
     """Return the row of that name; CzError names those that exist."""
-    for row in ROWS:
+    for row in rows:
         if row.name == ALIASES.get(name, name):
             return row
-    raise CzError(unknown("scenario", name, [row.name for row in ROWS]))
+    raise CzError(unknown("scenario", name, [row.name for row in rows]))
 
 
 def contract_hash(rows: Sequence[Row]) -> str:
     """The hash of what figures rest on: plant, scenarios, interval, horizon of the random rows; reward and metrics."""
-    from .metrics import ALMOST, PULL_WINDOW, metric_names
+    from .crystal_metrics import kind_of
+    from .metrics import ALMOST, PULL_WINDOW, names_of
 
     random = [row.config() for row in rows if not find_scenario(row.scenario).deterministic]
     configs = random or [row.config() for row in rows]
-    parts = [*sorted(config.hash for config in configs), configs[0].reward_hash, *metric_names()]
+    parts = [*sorted(config.hash for config in configs), configs[0].reward_hash, *names_of(kind_of(rows[0].process))]
     parts += [str(number) for number in (PULL_WINDOW, PULL_TOLERANCE, TOLERANCE, ALMOST)]
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:12]

@@ -3,14 +3,14 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
-from cz_gym.body.signals import Logged
 from cz_gym.evaluation.contender import Contender
 
-from .metrics import metric_names, metrics, outside
+from .crystal_metrics import measured
+from .metrics import Metrics, names_of, outside
 from .protocol import Row
 from .rollout import Floats, Rollout
 from .statistics import Estimate, Resamples, cvar, differences, means, optimality_gap, probability_of_improvement
@@ -25,6 +25,9 @@ GAPS = {"cost": 1, "rmse_mm": 2}
 """Metrics of which optimality gaps are made, with their powers."""
 TAIL_METRICS = ("rmse_mm", "rmse_observable_mm", "max_error_mm")
 """Metrics whose worst 5 % are reported."""
+LARGEST = 0.95
+"""Level of the quantiles that are reported of :data:`LARGEST_ERRORS` [-]."""
+LARGEST_ERRORS = ("crown_max_mm", "tail_max_mm", "max_error_mm")
 
 
 @dataclass(frozen=True)
@@ -34,26 +37,27 @@ class Sample:
     contender: Contender
     seeds: tuple[int, ...]
     values: Floats
-    """Metrics in the order of :func:`metric_names`, shape (training seeds or 1, episodes, metrics)."""
+    """Metrics in the order of :attr:`names`, shape (training seeds or 1, episodes, metrics)."""
     microseconds: float
     """Time in the policy per step and episode [us]."""
-    example: Logged | None = None
+    example: Any = None
     """Signals of the first episode up to its end, each of shape (steps,), of the first training seed."""
     outside: Floats | None = None
     """Share of time outside the row's tolerance band [-], shape (training seeds or 1, episodes), if it has one."""
+    kind: Any = Metrics
+    """Type of its metrics."""
 
     @classmethod
     def of(cls, contender: Contender, runs: Iterable[Rollout], tolerance: float | None = None) -> Self:
         """Metrics of rollouts on the same episodes, one a training seed, and the signals of the first one."""
         example, values, times, shares = None, [], [], []
         for run in runs:
-            example, seeds = example or run.episode(0), run.seeds
-            values.append(np.stack(metrics(run), axis=-1))
+            example, seeds, found = example or run.episode(0), run.seeds, measured(run)
+            values.append(np.stack(found, axis=-1))
             times.append(run.microseconds_per_step)
             shares += [outside(run, tolerance)] if tolerance else []
-        return cls(
-            contender, seeds, np.stack(values), float(np.mean(times)), example, np.array(shares) if shares else None
-        )
+        outside_of = np.array(shares) if shares else None
+        return cls(contender, seeds, np.stack(values), float(np.mean(times)), example, outside_of, type(found))
 
     @classmethod
     def joined(cls, seeds: Sequence[int], parts: Sequence[Self]) -> Self:
@@ -71,7 +75,12 @@ class Sample:
 
     def metric(self, name: str) -> Floats:
         """One metric, shape (training seeds or 1, episodes)."""
-        return self.values[:, :, metric_names().index(name)]
+        return self.values[:, :, self.names.index(name)]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its metrics."""
+        return names_of(self.kind)
 
     def first(self, episodes: int) -> Self:
         """The same sample on its first episodes."""
@@ -106,6 +115,11 @@ class Result:
     """Mean paired difference of RMSE of each agent, agent less rival [mm]."""
     earlier_bound: Sample | None = None
     """Sample of an earlier run that gaps are measured from where :data:`BOUND` took no part."""
+
+    @property
+    def largest(self) -> Estimates:
+        """Quantiles of :data:`LARGEST_ERRORS` over crystals and training seeds at :data:`LARGEST`."""
+        return {sample.name: dict(_largest(sample)) for sample in self.samples}
 
     @property
     def seeds(self) -> tuple[int, ...]:
@@ -155,6 +169,14 @@ def summarise(row: Row, samples: Sequence[Sample], earlier_bound: Sample | None 
 Draw = Callable[[int], Resamples]
 
 
+def _largest(sample: Sample) -> Iterable[tuple[str, Estimate]]:
+    for name in LARGEST_ERRORS:
+        known = sample.metric(name) if name in sample.names else np.array(np.nan)
+        known = known[~np.isnan(known)]
+        if known.size:
+            yield name, Estimate(float(np.quantile(known, LARGEST)), None, len(sample.seeds))
+
+
 def common(*samples: Sample) -> tuple[Sample, ...]:
     """The samples on the episodes that all of them met, the first ones."""
     fewest = min(len(sample.seeds) for sample in samples)
@@ -162,13 +184,13 @@ def common(*samples: Sample) -> tuple[Sample, ...]:
 
 
 def _means(sample: Sample, resamples: Draw) -> dict[str, Estimate]:
-    estimates = dict(zip(metric_names(), means(sample.values, resamples(len(sample.seeds))), strict=True))
+    estimates = dict(zip(sample.names, means(sample.values, resamples(len(sample.seeds))), strict=True))
     return {**estimates, SPEED: Estimate(sample.microseconds, None, len(sample.seeds))}
 
 
 def _paired(resamples: Draw, ours: Sample, theirs: Sample) -> dict[str, Estimate]:
     estimates = differences(ours.values, theirs.values, resamples(len(ours.seeds)))
-    return dict(zip(metric_names(), estimates, strict=True))
+    return dict(zip(ours.names, estimates, strict=True))
 
 
 def _improvement(resamples: Draw, ours: Sample, theirs: Sample) -> dict[str, Estimate]:

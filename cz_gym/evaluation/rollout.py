@@ -31,7 +31,7 @@ class Rollout:
     reward: Floats
     """Reward, 0 after the end, shape (steps, episodes)."""
     alive: npt.NDArray[np.bool_]
-    """Whether the step was taken: true up to and including a failing one, shape (steps, episodes)."""
+    """Whether the step was taken: true up to and including the last one, shape (steps, episodes)."""
     failed: npt.NDArray[np.bool_]
     """Whether the episode ended in a failure, shape (episodes,)."""
     start: Any
@@ -42,7 +42,8 @@ class Rollout:
     @property
     def microseconds_per_step(self) -> float:
         """Time in ``predict`` per step of one episode, batched [us]."""
-        return self.seconds_in_policy / MICRO / self.alive.size
+        steps = self.alive.any(axis=1).sum() * self.alive.shape[1]
+        return float(self.seconds_in_policy / MICRO / steps)
 
     def episode(self, i: int) -> Any:
         """Signals of episode ``i`` up to its end, each of shape (steps,); a copy."""
@@ -92,8 +93,11 @@ def rollout(
             # A slot that is over is drawn anew by the next step: only then does its policy begin again.
             begins, over = over, terminated | truncated
             running &= ~over
+            done = 1 if running.any() else config.steps - k
             if progress is not None:
-                progress(n)
+                progress(done * n)
+            if done > 1:
+                break
     return Rollout(config, seeds, signals, reward, alive, failed, start, seconds)
 
 

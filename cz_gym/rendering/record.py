@@ -8,6 +8,8 @@ import numpy.typing as npt
 
 from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.config import Config
+from cz_gym.crystal import recipe, task
+from cz_gym.crystal.process import CRYSTAL
 
 DRAWN = frozenset({"r_c", "r_ref", "r_br", "r_br_measured", "h_c", "v_p", "Q_H", "T_1", "T_1_ref", "T_b"})
 """Rows of ``info`` that a picture shows; a process without them has none."""
@@ -20,11 +22,15 @@ class Ending(Enum):
     FROZEN = "FROZEN: meniscus too low"
     DETACHED = "DETACHED: meniscus too high"
     LOST = "RADIUS LOST: too far off"
+    COLD = "FROZEN: melt below its melting point"
     HORIZON = "END OF THE RUN"
+    DONE = "GROWN: the length is reached"
 
 
 class Record:
     """The samples of one episode, oldest first: signals of ``info`` in SI units, and quantities derived from them."""
+
+    environment = "Cz-v0"
 
     def __init__(self, config: Config, slot: Any, scenario: str) -> None:
         self.config, self.scenario = config, scenario
@@ -44,7 +50,7 @@ class Record:
         row[:-1], row[-1] = info, valid
         self._count += 1
         if terminated:
-            self.ending = self._failure()
+            self.ending = self._end()
         elif truncated:
             self.ending = Ending.HORIZON
 
@@ -68,9 +74,24 @@ class Record:
         return self.column("r_c") - self.column("r_ref")
 
     @property
+    def nominal(self) -> tuple[float, float, float]:
+        """Nominal pull speed [m/s], heater power [W] and melt temperature [K] now."""
+        return self.puller.v_0, self.puller.Q_H_0, self.puller.T_b_0
+
+    @property
+    def ring_bias(self) -> Any:
+        """What the operator takes off the ring [m]."""
+        return self.puller.ring_bias
+
+    @property
+    def lowest(self) -> float:
+        """Lowest meniscus before it freezes [m]."""
+        return HEIGHT_MIN
+
+    @property
     def camera_error(self) -> Floats:
         """Radius error of every sample by the camera, its operator's bias subtracted [m]; NaN without a reading."""
-        radius = self.column("r_br_measured") - self.puller.ring_bias
+        radius = self.column("r_br_measured") - self.ring_bias
         return np.where(self.column("valid") > 0.0, radius, np.nan) - self.column("r_ref")
 
     @property
@@ -94,7 +115,7 @@ class Record:
         z = self.last("h_c") + (length[-1] - length[remains])
         return self.column("r_c")[remains][::-1], self.column("r_ref")[remains][::-1], z[::-1]
 
-    def _failure(self) -> Ending:
+    def _end(self) -> Ending:
         """The limit that the newest sample broke, or came nearest to where its last substep was discarded."""
         h_c, a = self.last("h_c"), self.puller.a
         room = {
@@ -103,3 +124,51 @@ class Record:
             Ending.LOST: 1.0 - abs(self.error[-1]) / self.config.radius_limit,
         }
         return min(room, key=lambda ending: float(room[ending]))
+
+
+class CrystalRecord(Record):
+    """The samples of a whole crystal: its references are those of the recipe at the length grown."""
+
+    environment = "CzCrystal-v0"
+
+    def __init__(self, config: Config, slot: Any, scenario: str) -> None:
+        super().__init__(config, slot, scenario)
+        self._table = np.array(slot["table"])
+
+    @property
+    def nominal(self) -> tuple[float, float, float]:
+        """The recipe's pull speed [m/s], heater power [W] and melt temperature [K] now."""
+        return self.last("v_p_ref"), self.last("Q_H_ref"), float(self._recipe(recipe._T_b)[-1])
+
+    @property
+    def ring_bias(self) -> Any:
+        """The recipe's ring less its radius at each sample [m]."""
+        return self._recipe(recipe._ring)
+
+    def _recipe(self, column: int) -> Floats:
+        """A column of the recipe at each sample's length."""
+        place = self.column("L") / recipe.spacing(self.puller) + recipe.MARGIN
+        values: Floats = np.interp(place, np.arange(recipe.ROWS), self._table[:, column])
+        return values
+
+    @property
+    def lowest(self) -> float:
+        """Lowest meniscus before it freezes [m]."""
+        return task.HEIGHT_MIN
+
+    @property
+    def length(self) -> Floats:
+        """Length grown since the crown began, at every sample [m]."""
+        return self.column("L")
+
+    def _end(self) -> Ending:
+        if self.last("succeeded") > 0.0:
+            return Ending.DONE
+        at = self.config.process.Logged(*self._samples[self._count - 1, :-1])
+        rooms = task.room(at, self.config.radius_limit, self.config.parameters)
+        return (Ending.FROZEN, Ending.DETACHED, Ending.LOST, Ending.COLD)[int(np.argmin(rooms))]
+
+
+def record_for(config: Config, slot: Any, scenario: str) -> Record:
+    """An empty record for an episode of an environment."""
+    return (CrystalRecord if config.process is CRYSTAL else Record)(config, slot, scenario)

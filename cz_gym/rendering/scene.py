@@ -64,10 +64,10 @@ def _draw_header(canvas: Canvas, record: Record) -> None:
     """Scenario, time, length grown, and whether the crystal grows."""
     hours, rest = divmod(round(float(record.t[-1])), round(HOUR))
     minutes, seconds = divmod(rest, round(MINUTE))
-    canvas.text(10, 7, "Cz-v0", size=14, bold=True)
-    canvas.text(64, 10, record.scenario, palette.FAINT, 11)
+    canvas.text(10, 7, record.environment, size=14, bold=True)
+    canvas.text(14 + 9 * len(record.environment), 10, record.scenario, palette.FAINT, 11)
     time, grown = f"{hours}:{minutes:02d}:{seconds:02d}", f"{record.length[-1] / MM:.1f} mm"
-    for x, name, value in ((200, "time", time), (312, "grown", grown)):
+    for x, name, value in ((204, "time", time), (312, "grown", grown)):
         canvas.text(x, 10, name, palette.FAINT, 11)
         canvas.text(x + 42, 7.5, value, size=13, bold=True)
     status, colour = ("growing", palette.WELL) if record.ending is None else ("ended", palette.ALARM)
@@ -82,14 +82,14 @@ Row = tuple[str, str, Colour]
 
 def numbers(record: Record) -> list[list[Row]]:
     """The rows of a record's newest sample; the first of each group is a signal, those below it its references."""
-    p, last = record.puller, record.last
+    last, (v_p, Q_H, T_b) = record.last, record.nominal
     return [
         [_row("by the camera", record.camera_error[-1] + last("r_ref"), MM, "mm", palette.CAMERA),
          _row("reference", last("r_ref"), MM, "mm", palette.REFERENCE)],
-        [_row("pull speed", last("v_p"), MM_PER_MIN, "mm/min", palette.DRIVE), _row("nominal", p.v_0, MM_PER_MIN)],
-        [_row("heater", last("Q_H"), KILO, "kW", palette.DRIVE), _row("nominal", p.Q_H_0, KILO)],
+        [_row("pull speed", last("v_p"), MM_PER_MIN, "mm/min", palette.DRIVE), _row("nominal", v_p, MM_PER_MIN)],
+        [_row("heater", last("Q_H"), KILO, "kW", palette.DRIVE), _row("nominal", Q_H, KILO)],
         [_row("heater T_1", last("T_1"), 1.0, "K", palette.TEMPERATURE), _row("recipe", last("T_1_ref"))],
-        [_row("melt T_b", last("T_b"), 1.0, "K", palette.TEMPERATURE), _row("nominal", p.T_b_0)],
+        [_row("melt T_b", last("T_b"), 1.0, "K", palette.TEMPERATURE), _row("nominal", T_b)],
     ]  # fmt: skip
 
 
@@ -158,5 +158,6 @@ def _draw_time_axis(canvas: Canvas, plot: Box, horizon: float) -> None:
 def _draw_ending(canvas: Canvas, box: Box, ending: Ending) -> None:
     """A band across a panel that says how the episode ended."""
     band = Box(box.x, box.y + 6, box.w, 20)
-    canvas.rectangle(palette.RIM if ending is Ending.HORIZON else palette.ALARM, band)
+    fine = ending in (Ending.HORIZON, Ending.DONE)
+    canvas.rectangle(palette.RIM if fine else palette.ALARM, band)
     canvas.text(box.x + box.w / 2.0, band.y + 3.5, ending.value, size=11, anchor=0.5, bold=True)

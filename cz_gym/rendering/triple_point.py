@@ -13,10 +13,13 @@ from cz_gym.support.units import MM
 from . import palette
 from .canvas import Box, Canvas, first_at_least
 from .palette import Colour
-from .record import Ending, Floats, Record
+from .record import CrystalRecord, Ending, Floats, Record
 
 INSIDE = 11.0 * MM
 """Distance that the panel shows inside r_0, at least [m]; crystals are lost at 8 mm."""
+WIDER, LEAST_WIDTH, DEEP = 1.45, 14.0 * MM, 0.2
+"""Width of a whole crystal's panel in largest radii [-], the least radius that counts [m], and the melt's share of the
+panel's height [-]."""
 BELOW, ABOVE = 9.0 * MM, 24.0 * MM
 """Heights that it shows below the melt's surface, and above it at least [m]."""
 POINTS = 48
@@ -47,7 +50,12 @@ class Scale(NamedTuple):
 
 
 def scale_of(box: Box, record: Record) -> Scale:
-    """The panel's scale: from 11 mm inside r_0 to 11 mm outside the nominal ring, at least."""
+    """The panel's scale: from 11 mm inside r_0 to 11 mm outside the nominal ring, at least; of a whole crystal from its
+    axis outwards, wider while the crown grows.
+    """
+    if isinstance(record, CrystalRecord):
+        per_metre = box.w / (WIDER * max(record.column("r_ref").max(), LEAST_WIDTH))
+        return Scale(box.x, box.bottom - DEEP * box.h, per_metre)
     across = 2.0 * INSIDE + record.puller.ring_bias
     per_metre = min(box.w / across, box.h / (BELOW + ABOVE))
     axis = box.x + 0.5 * box.w - (record.puller.r_0 + 0.5 * record.puller.ring_bias) * per_metre
@@ -55,14 +63,14 @@ def scale_of(box: Box, record: Record) -> Scale:
 
 
 def meniscus_curve(
-    r_c: float, h_c: float, p: Puller, model: MeniscusModel, phi_b: float
+    r_c: float, h_c: float, p: Puller, model: MeniscusModel, phi_b: float, lowest: float = HEIGHT_MIN
 ) -> tuple[Floats, Floats, float]:
     """Radius and height [m] along Hurle's profile, from the triple point outwards, and the height of the bright ring.
 
     The profile is Hurle's whatever the model; its slope at the triple point is the model's own. Heights are clipped to
     their limits, as the ring of a failed state is measured.
     """
-    h = min(max(h_c, HEIGHT_MIN), HEIGHT_MAX_IN_A * p.a)
+    h = min(max(h_c, lowest), HEIGHT_MAX_IN_A * p.a)
     M = float(profile_scale(r_c, h, model.slope(r_c, h, p)[1], p.a))
     z = h * LOWEST ** np.linspace(0.0, 1.0, POINTS)
     return r_c + profile(z, M) - profile(h, M), z, M * math.sqrt(1.0 - math.cos(phi_b))
@@ -83,7 +91,9 @@ def draw(canvas: Canvas, box: Box, record: Record) -> None:
             canvas.rectangle(palette.GAS, Box(box.x, y[0], box.w, scale.y_0 - y[0]))
         else:
             config, h_c = record.config, record.last("h_c")
-            r, h, z_b = meniscus_curve(r_c[0], h_c, record.puller, config.meniscus, config.parameters.phi_b)
+            r, h, z_b = meniscus_curve(
+                r_c[0], h_c, record.puller, config.meniscus, config.parameters.phi_b, record.lowest
+            )
             out, down, right, level = scale.x(r), scale.y(h), box.right + 9, scale.y_0 + 1
             gas_x, gas_y = np.r_[x[::-1], out, right, right, x[-1]], np.r_[y[::-1], down, down[-1], box.y, box.y]
             canvas.polygon(palette.GAS, gas_x, gas_y)

@@ -14,7 +14,7 @@ from cz_gym.process import Process
 from cz_gym.support.names import unknown
 
 from .canvas import MISSING, Frame, available, load
-from .record import DRAWN, Record
+from .record import DRAWN, Record, record_for
 from .scene import Scene
 
 MODES = ("human", "rgb_array")
@@ -25,8 +25,8 @@ SMALLEST, LARGEST = 360, 3840
 
 
 def declared_modes(process: Process = BODY) -> list[str]:
-    """The render modes that can be drawn here: none without pygame, and those of a crystal's body alone."""
-    return list(MODES) if available() and set(process.info) >= DRAWN and not process.table[0] else []
+    """The render modes that can be drawn here: none without pygame, or of a process that logs less."""
+    return list(MODES) if available() and set(process.info) >= DRAWN else []
 
 
 def check_size(size: Any) -> tuple[int, int]:
@@ -51,7 +51,7 @@ def make_view(render_mode: str | None, size: Any, config: Config) -> "View | Non
     if not available():
         raise DependencyNotInstalled(MISSING)
     if not declared_modes(config.process):
-        raise CzError("a picture shows the body of a crystal on its melt: for this process render_mode must be None")
+        raise CzError("a picture shows a crystal on its melt: for this process render_mode must be None")
     return View(render_mode, width, height, config)
 
 
@@ -76,7 +76,7 @@ class View:
 
     def begin(self, info: npt.NDArray[np.float64], slot: Any, scenario: str) -> None:
         """Begin the record of an episode at its first sample, or at the one where a state was restored."""
-        self.record = Record(self.config, slot, scenario)
+        self.record = record_for(self.config, slot, scenario)
         self.add(info, float(slot["valid"]))
 
     def add(

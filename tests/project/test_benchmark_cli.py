@@ -97,6 +97,46 @@ def test_the_folder_holds_every_file_and_nothing_else(finished):
         assert f"]({image.name})" in report
 
 
+@pytest.fixture(scope="module")
+def crystals(tmp_path_factory):
+    """The folder of a small run of whole crystals' stages."""
+    out = tmp_path_factory.mktemp("crystals") / "out"
+    small = ["--episodes", "3", "--scenarios", "crown,tail-puller", "--controllers", "recipe,ring-pid,true-radius"]
+    assert benchmark.main(["--env", "CzCrystal-v0", *small, "--out", str(out), "--quiet"]) == 0
+    return out
+
+
+def test_stages_of_whole_crystals_have_the_same_report_with_metrics_of_their_own(crystals):
+    assert sorted(path.name for path in crystals.iterdir()) == FILES
+    data, report = json.loads((crystals / "benchmark.json").read_text()), (crystals / "report.md").read_text()
+    assert list(data["results"]) == ["crown", "tail-puller"]
+    found = data["results"]["crown"]["ring-pid"]
+    assert (found["failure_rate"]["mean"], found["frozen"]["mean"], found["lost_in_crown"]["mean"]) == (1.0, 1.0, 1.0)
+    assert found["tail_max_mm"] == {"mean": None, "ci95": None, "n": 3}
+    assert data["largest"]["crown"]["true-radius"]["crown_max_mm"]["mean"] < 1.0
+    assert data["provenance"]["parameters"]["heater_max"] is None
+    assert report.startswith("recipe loses the fewest crystals, ")
+    assert "| ring-pid | 3 frozen | - | - |" in report
+    assert "| controller | lost of crown / tail-puller [%] | 95 % of crowns [mm] | body within 0.5 mm [%] |" in report
+
+
+def test_whole_crystals_are_quoted_in_two_pages(crystals, tmp_path, monkeypatch):
+    pages = [tmp_path / "README.md", tmp_path / "crystal.md"]
+    for page in pages:
+        page.write_text(
+            "a\n<!-- crystal:begin -->\n<!-- crystal:end -->\n<!-- benchmark:begin -->\n<!-- benchmark:end -->"
+        )
+    monkeypatch.setattr(benchmark, "CRYSTALS", tmp_path / "results")
+    monkeypatch.setattr(benchmark, "README", pages[0])
+    monkeypatch.setattr(benchmark, "CRYSTAL_PAGE", pages[1])
+    monkeypatch.setattr(benchmark, "is_partial", lambda *_: False)
+    small = ["--scenarios", "crown-nominal", "--controllers", "recipe", "--quiet"]
+    assert benchmark.main(["--env", "CzCrystal-v0", *small]) == 0
+    for page in pages:
+        assert "| recipe | 0.00 | 0." in page.read_text()
+        assert page.read_text().endswith("<!-- benchmark:begin -->\n<!-- benchmark:end -->")
+
+
 @pytest.mark.slow
 def test_processes_side_by_side_find_the_same(finished, tmp_path, monkeypatch):
     """All but the time in the policies, which is measured."""
@@ -340,6 +380,11 @@ def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(tmp_path,
     ("option", "value", "message"),
     [
         ("--episodes", "0", "between 1 and 500, not 0"),
+        ("--env", "Cz", "invalid choice: 'Cz'"),
+        ("--scenarios=crow", "--env=CzCrystal-v0", "unknown scenario 'crow': did you mean 'crown'"),
+        ("--controllers=paper", "--env=CzCrystal-v0", "unknown controller 'paper'; choose from recipe, ring-pid"),
+        ("--tolerance=1", "--env=CzCrystal-v0", "beside --puller FILE.toml, of Cz-v0"),
+        ("--agent=crown", "--env=CzCrystal-v0", "crown: no such file"),
         ("--controllers", "pid", "unknown controller 'pid'; choose from open-loop, paper"),
         ("--controllers", "paper,,ppo", "names with commas between"),
         ("--scenarios", "easy", "unknown scenario 'easy'; choose from randomized, hard"),

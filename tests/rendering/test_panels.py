@@ -5,6 +5,7 @@ import pytest
 from scipy.integrate import trapezoid
 
 from cz_gym import HURLE, CzEnv, Parameters, make_puller
+from cz_gym.crystal.env import CzCrystalEnv
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.rendering import palette, scene, triple_point
@@ -18,9 +19,9 @@ CANVAS = Canvas(640, 480)
 PANELS = layout(CANVAS.box)
 
 
-def grown(steps=240, pull=0.0, **arguments):
+def grown(steps=240, pull=0.0, kind=CzEnv, **arguments):
     """A crystal pulled with a slow swing of the pull speed, so that its surface is not straight."""
-    env = CzEnv(render_mode="rgb_array", observation="measured", **arguments)
+    env = kind(render_mode="rgb_array", observation="measured", **arguments)
     env.reset(seed=4)
     for k in range(steps):
         if env.step(np.array([pull + 0.25 * np.sin(0.06 * k), 0.0], np.float32))[2]:
@@ -44,6 +45,36 @@ def check_near(pixels, expected, reach):
 @pytest.fixture(scope="module")
 def picture():
     return grown()
+
+
+def test_a_whole_crystals_scale_follows_its_crown():
+    """From the axis on; the camera's radius is that of the recipe's ring; the header and the end say what it is."""
+    widths = []
+    for steps in (100, 900):
+        frame, record = grown(steps, kind=CzCrystalEnv, action="direct", scenario="nominal")
+        scale = triple_point.scale_of(PANELS.triple_point, record)
+        assert scale.x(0.0) == PANELS.triple_point.x
+        assert near(frame[round(scale.y_0) - 1], palette.MELT).any()
+        row, (r_c, _, z) = round(scale.y(record.last("h_c") + 5 * MM)), record.surface()
+        edge = np.interp((scale.y_0 - (row + 0.5)) / scale.per_metre, z, r_c)
+        check_near(near(frame[row], palette.TRUE), scale.x(edge), 8)
+        widths.append(scale.per_metre)
+        assert abs(record.camera_error[-1] - record.error[-1]) < 2 * MM
+    assert widths[0] > 2.0 * widths[1]
+    assert record.length[-1] == record.last("L")
+
+
+@pytest.mark.parametrize(
+    ("moved", "by", "ending"),
+    [("r_c", 13 * MM, "LOST"), ("h_c", 9 * MM, "DETACHED"), ("T_b", -30.0, "COLD"), ("L", 0.03, "DONE")],
+)
+def test_how_a_whole_crystal_ends(moved, by, ending):
+    env = CzCrystalEnv(render_mode="rgb_array", observation="measured", scenario="nominal", stage=1.24)
+    env.reset(seed=0)
+    env._slots["x"][moved] += by
+    assert env.step(np.zeros(2, np.float32))[2]
+    assert env._view.record.ending is Ending[ending]
+    assert env.render().shape == (480, 640, 3)
 
 
 def test_the_drawn_surface_is_the_logged_radius(picture):

@@ -23,7 +23,7 @@ SMOOTH = 5.0 * MINUTE
 """Length of the running mean of the drives [s], drawn over their single steps."""
 
 
-def example(sample: Sample) -> Logged:
+def example(sample: Sample) -> Any:
     """Return the signals of a sample's first crystal, which every sample of a run has."""
     if sample.example is None:
         raise ValueError(f"the sample of {sample.name} has no signals")

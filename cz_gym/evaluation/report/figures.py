@@ -10,7 +10,7 @@ from cz_gym.evaluation.results import Result
 from cz_gym.evaluation.statistics import Estimate
 
 from .canvas import GREY, INK, canvas, chosen, png, styles_of
-from .crystal import crystal
+from .contents import contents_of
 from .tables import PULL_STEP, RMSE
 
 FAR = 20
@@ -23,7 +23,7 @@ def draw_figures(results: Sequence[Result]) -> dict[str, bytes]:
     """Draw every figure, by file name; without a random scenario there is only the crystal."""
     random = [result for result in results if len(result.seeds) > 1]
     with rc_context({"text.parse_math": False}):  # a name with dollar signs is no formula
-        figures = {"crystal.png": crystal(results[0])}
+        figures = {"crystal.png": contents_of(results[0].row).picture(results[0])}
         if random:
             figures["pareto.png"] = pareto(random)
     return figures

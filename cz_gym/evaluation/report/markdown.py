@@ -6,49 +6,35 @@ from dataclasses import replace
 
 import numpy as np
 
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.evaluation.protocol import contract_hash
-from cz_gym.evaluation.results import BOUND, REFERENCE, SPEED, Result, Sample, common
+from cz_gym.evaluation.results import BOUND, REFERENCE, Result, Sample, common
 from cz_gym.machine.puller import DEFAULT
 from cz_gym.support.units import HOUR, MM, PERCENT
 
 from . import grower
 from .canvas import COLUMNS, chosen
+from .contents import contents_of
 from .tables import (
-    DRIVES,
-    ERROR,
-    FAILURES,
-    HEATER_STEP,
-    PULL_STEP,
+    NOTHING,
     RMSE,
     WHO,
     Column,
     comparison,
     crystals,
     deciding,
-    overview,
     rows,
-    verdict,
     who,
 )
 from .tables import markdown as table
 
-SHORT = (
-    Column("max_error_mm", "max [mm]", 2, interval=False),
-    Column("within_half_mm", "in 0.5 mm [%]", 1, PERCENT, interval=False),
-    PULL_STEP._replace(heading="pull step [mm/min]", interval=False),
-    HEATER_STEP._replace(heading="heater step [kW]", interval=False),
-    FAILURES._replace(interval=False),
-    Column(SPEED, "compute [us/step]", 2),
-)
-"""Columns without intervals, between RMSE and its paired difference."""
-LESS = RMSE._replace(heading=f"RMSE less {REFERENCE}'s [mm]", kind="paired")
-BEGIN, END = "<!-- benchmark:begin -->", "<!-- benchmark:end -->"
+MARKERS = "<!-- {}:begin -->", "<!-- {}:end -->"
 """Markers around the part of a page that :func:`fill_in` writes."""
 
 
 def summary(results: Sequence[Result]) -> str:
     """Return :func:`overview` in Markdown, and its contract below."""
-    heads, groups = overview(results)
+    heads, groups = contents_of(results[0].row).overview(results)
     lines = [line for group, listed in groups.items() for line in ((f"*{group}*", *[""] * (len(heads) - 1)), *listed)]
     contract = contract_hash([result.row for result in results])
     rests_on = "plant, random scenarios, interval, horizon, reward, metrics"
@@ -58,32 +44,26 @@ def summary(results: Sequence[Result]) -> str:
 def brief(results: Sequence[Result]) -> str:
     """Return :func:`summary` of the random scenarios, of the controllers that the figure of a crystal shows."""
     first, *others = deciding(results)
+    if first.row.process is CRYSTAL:
+        return summary(results)
     return summary([replace(first, samples=tuple(chosen(first.samples, COLUMNS))), *others])
 
 
 def fill_in(page: str, results: Sequence[Result]) -> str:
     """Return a page with :func:`brief` between its two markers; the page itself if it has none."""
-    before, begin, rest = page.partition(BEGIN)
-    _, end, after = rest.partition(END)
+    first, last = (marker.format("crystal" if results[0].row.process is CRYSTAL else "benchmark") for marker in MARKERS)
+    before, begin, rest = page.partition(first)
+    _, end, after = rest.partition(last)
     return f"{before}{begin}\n{brief(results)}\n{end}{after}" if end else page
 
 
 def markdown(results: Sequence[Result], command: str, figures: Iterable[str]) -> str:
     """Return ``report.md``; it begins with :func:`verdict`."""
     row = results[0].row
-    config, most = row.config(), max(len(result.seeds) for result in results)
     parts = [
         *(_verdict(results) if row.tolerance is None else _for_a_grower(results)),
         "# Benchmark",
-        f"Every controller meets the same crystals (test seeds), {config.horizon / HOUR:.3g} h each at "
-        f"{config.control_interval:g} s control, on {row.grown_on}.",
-        "The tables show means over crystals with 95 % bootstrap intervals; a scenario without randomness is one "
-        f"crystal and has no interval. After a failure the radius error counts {config.radius_limit / MM:.3g} mm to "
-        "the end; drives, growth rate and ground-off are those of the time before it. No failure in n crystals still "
-        f"allows a rate of up to 3/n, {3 / most / PERCENT:.2g} % at n = {most}. The verdict compares radius errors "
-        "alone: who moves the pull speed more can have less. docs/controllers/bounds.md compares at equal pull steps, "
-        "docs/benchmark.md has the protocol and every formula.",
-        "RMSE of the true radius [mm] with 95 % interval and failures on each scenario, pull steps on the first.",
+        *(_of_crystals(results) if row.process is CRYSTAL else _of_bodies(results)),
         summary(results),
         *(f"![{name.removesuffix('.png')}]({name})" for name in figures),
         "## Who took part",
@@ -95,8 +75,47 @@ def markdown(results: Sequence[Result], command: str, figures: Iterable[str]) ->
     return "\n\n".join(parts) + "\n"
 
 
+INTERVALS = (
+    "The tables show means over crystals with 95 % bootstrap intervals; a scenario without randomness is one crystal "
+    "and has no interval."
+)
+
+
+def _none_of(results: Sequence[Result]) -> str:
+    most = max(len(result.seeds) for result in results)
+    return f"No failure in n crystals still allows a rate of up to 3/n, {3 / most / PERCENT:.2g} % at n = {most}."
+
+
+def _of_bodies(results: Sequence[Result]) -> list[str]:
+    """What was measured, and how it counts."""
+    row = results[0].row
+    config = row.config()
+    return [
+        f"Every controller meets the same crystals (test seeds), {config.horizon / HOUR:.3g} h each at "
+        f"{config.control_interval:g} s control, on {row.grown_on}.",
+        f"{INTERVALS} After a failure the radius error counts {config.radius_limit / MM:.3g} mm to "
+        f"the end; drives, growth rate and ground-off are those of the time before it. {_none_of(results)} The verdict "
+        "compares radius errors alone: who moves the pull speed more can have less. docs/controllers/bounds.md "
+        "compares at equal pull steps, docs/benchmark.md has the protocol and every formula.",
+        "RMSE of the true radius [mm] with 95 % interval and failures on each scenario, pull steps on the first.",
+    ]
+
+
+def _of_crystals(results: Sequence[Result]) -> list[str]:
+    """The same of whole crystals."""
+    row = results[0].row
+    return [
+        f"Every controller meets the same whole crystals, or parts of them (test seeds), at {row.control_interval:g} s "
+        f"control, on {row.grown_on}.",
+        f"{INTERVALS} Errors are those of the true radius against the recipe's at the length grown; a crystal that is "
+        f"lost in crown or tail has the largest allowed one there. What is said of the body is said of the length that "
+        f"was grown. {_none_of(results)} docs/crystal.md explains every column.",
+        "Losses on each stage; crown, body and tail where the stage grows them; energy is that of the body.",
+    ]
+
+
 def _verdict(results: Sequence[Result]) -> list[str]:
-    found = verdict(results)
+    found = contents_of(results[0].row).verdict(results)
     return [found.sentence, *([table(found.heads, found.rows)] if found.rows else [])]
 
 
@@ -111,12 +130,12 @@ def _for_a_grower(results: Sequence[Result]) -> list[str]:
 
 
 def _scenario(result: Result) -> list[str]:
-    meaning = result.row.meaning
+    meaning, shown = result.row.meaning, contents_of(result.row)
     parts = [
         f"## {result.row.name} ({crystals(len(result.seeds))})",
         f"{meaning[0].upper()}{meaning[1:]}.",
-        _metrics(result, ERROR),
-        _metrics(result, DRIVES),
+        *(_metrics(result, columns) for columns in shown.columns),
+        *([table(*shown.losses(result))] if shown.losses else []),
     ]
     if columns := comparison(result):
         parts += [_metrics(result, columns), *filter(None, [measured_from(result)])]
@@ -164,15 +183,16 @@ def _training_seeds(pooled: Sequence[Sample]) -> str:
 
 def terminal(results: Sequence[Result]) -> str:
     """Return a short table a scenario, RMSE with its interval, then means, and the verdict or the recommendation."""
-    found = verdict(results, RMSE._replace(interval=False))
+    found = contents_of(results[0].row).verdict(results, RMSE._replace(interval=False))
     parts = [*map(_short, results), *([found.sentence] if found.rows or results[0].row.tolerance is None else [])]
     parts += [_aligned(found.heads, found.rows)] if found.rows else []
     return "\n\n".join(parts + ([grower.recommendation(results)] if results[0].row.tolerance else []))
 
 
 def _short(result: Result) -> str:
-    columns, row = (RMSE, *SHORT, LESS), result.row
+    row, columns = result.row, contents_of(result.row).short
     grown_on = f", on {row.grown_on}" if row.file or row.puller != DEFAULT else ""
+    columns = tuple(each for each in columns if any(cell != NOTHING for _, cell in rows(result, [each])))
     heads: Sequence[str] = ["controller", *(column.heading for column in columns)]
     lines = rows(result, columns)
     if row.tolerance is not None:

@@ -16,6 +16,7 @@ from cz_gym.evaluation.results import Result
 from cz_gym.support.units import HOUR, MM
 
 from . import grower, tables
+from .contents import contents_of
 from .markdown import measured_from
 from .page_pictures import crystal, pareto
 
@@ -33,11 +34,12 @@ _SLOT = re.compile(r"<!-- slot:(\w+) -->")
 
 def page(results: Sequence[Result], command: str) -> str:
     """Return the page; the same results give the same text."""
-    row, samples, found = results[0].row, results[0].samples, tables.verdict(results)
+    row, samples, shown = results[0].row, results[0].samples, contents_of(results[0].row)
+    found = shown.verdict(results)
     config, most = row.config(), max(len(result.seeds) for result in results)
     counted = tables.deciding(results)
     best = replace(counted[0], samples=tuple(tables.best_of_each_kind(counted)))
-    heads, groups = tables.overview([best, *counted[1:]])
+    heads, groups = shown.overview([best, *counted[1:]])
     parts = {
         "style": _asset("page.css"),
         "plotly": get_plotlyjs(),
@@ -48,8 +50,8 @@ def page(results: Sequence[Result], command: str) -> str:
         "answer_note": ANSWER_NOTE,
         "limit": f"{config.radius_limit / MM:.3g}",
         "lede": f"{tables.count(len(samples), 'controller')}, {tables.count(len(results), 'scenario')}, "
-        f"up to {tables.crystals(most)} each, the same for everyone: {config.horizon / HOUR:g} h at one action every "
-        f"{config.control_interval:g} s, on {row.grown_on}.",
+        f"up to {tables.crystals(most)} each, the same for everyone: at most {config.horizon / HOUR:.3g} h at one "
+        f"action every {config.control_interval:g} s, on {row.grown_on}.",
         "scenarios": _table(found.heads, found.rows) if found.rows else "",
         "tables": "\n".join(_metrics(result, is_open=result is results[0]) for result in results),
         "pareto": _html(pareto(results), "pareto"),
@@ -86,7 +88,8 @@ def _html(figure: Figure, name: str) -> str:
 
 def _metrics(result: Result, is_open: bool) -> str:
     """Every metric of a scenario, the lowest RMSE first, to unfold."""
-    columns = (*tables.ERROR, *tables.comparison(result), *tables.DRIVES)
+    error, drives = contents_of(result.row).columns
+    columns = (*error, *tables.comparison(result), *drives)
     ranked = sorted(result.samples, key=lambda sample: result.means[sample.name][tables.RMSE.metric].mean)
     heads = "controller", *(column.heading for column in columns)
     rows = tables.rows(replace(result, samples=tuple(ranked)), columns)

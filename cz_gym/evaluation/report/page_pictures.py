@@ -10,7 +10,7 @@ from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
 from cz_gym.body.cost import TOLERANCE
-from cz_gym.body.signals import Logged
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.env import CzEnv
 from cz_gym.evaluation.protocol import Row
 from cz_gym.evaluation.results import Result
@@ -95,7 +95,7 @@ class Panel(NamedTuple):
     unit: str
     scale: float
     """Size of the unit in SI units."""
-    lines: Mapping[str, Callable[[Logged, float], Floats]]
+    lines: Mapping[str, Callable[[Any, float], Floats]]
     """Lines by name, each a function of an episode's signals and the operator's bias [m], in SI units. "true" and
     "camera" (its reading) are drawn for each controller; other lines are the same for all and drawn once."""
     levels: tuple[float, ...] = ()
@@ -125,42 +125,65 @@ PANELS = (
     Panel("meniscus height", "mm", MM, {"true": lambda s, bias: s.h_c}),
     Panel("growth angle", "deg", np.pi / 180.0, {"true": lambda s, bias: s.alpha_c}, (0.0,)),
 )  # fmt: skip
+_RECIPES: dict[str, Callable[[Any, float], Floats]] = {
+    "pull speed": lambda s, bias: s.v_p_ref,
+    "heater power": lambda s, bias: s.Q_H_ref,
+    "meniscus height": lambda s, bias: s.h_ref,
+}
+CRYSTAL_PANELS = (
+    PANELS[0]._replace(lines={"true": PANELS[0].lines["true"]}),
+    PANELS[1]._replace(levels=()),
+    *(each._replace(lines={**each.lines, "recipe": line} if (line := _RECIPES.get(each.title)) else each.lines)
+      for each in PANELS[2:]),
+    Panel("v/G by the recipe's", "1", 1.0, {"true": lambda s, bias: s.v_over_G}, (1.0,)),
+)  # fmt: skip
+"""Panels of a whole crystal, against its length; the ring is not where the recipe's ring is while the radius is off."""
 OWN = ("true", "camera")
 """Lines that are drawn for each controller."""
 
 
 def crystal(results: Sequence[Result]) -> go.Figure:
     """Draw the first crystal of each scenario, one scenario at a time, under the controllers of :func:`chosen`."""
-    titles = [f"{panel.title} [{panel.unit}]" for panel in PANELS]
-    figure = make_subplots(len(PANELS), 1, shared_xaxes=True, vertical_spacing=0.02, subplot_titles=titles)
+    whole = results[0].row.process is CRYSTAL
+    panels = CRYSTAL_PANELS if whole else PANELS
+    titles = [f"{panel.title} [{panel.unit}]" for panel in panels]
+    figure = make_subplots(len(panels), 1, shared_xaxes=True, vertical_spacing=0.02, subplot_titles=titles)
     styles = styles_of(results[0].samples)
-    layouts = [_draw(figure, number, result, styles) for number, result in enumerate(results)]
-    for row, panel in enumerate(PANELS, 1):
+    layouts = [_draw(figure, number, result, styles, panels) for number, result in enumerate(results)]
+    for row, panel in enumerate(panels, 1):
         for level in panel.levels:
             line = {"color": GREY, "width": 1, "dash": "dot"}
             figure.add_hline(level, row=row, col=1, line=line, layer="below")
-    figure.update_xaxes(range=[0.0, results[0].row.config().horizon / MINUTE], hoverformat=".2f", nticks=10)
-    figure.update_xaxes(title="time [min]", row=len(PANELS), col=1)
+    if not whole:
+        figure.update_xaxes(range=[0.0, results[0].row.config().horizon / MINUTE])
+    figure.update_xaxes(hoverformat=".2f", nticks=10)
+    figure.update_xaxes(title="length [mm]" if whole else "time [min]", row=len(panels), col=1)
     legend = {"orientation": "h", "y": -0.04, "yanchor": "top", "groupclick": "togglegroup"}
-    figure.update_layout(legend=legend, height=150 * len(PANELS), hovermode="x")
+    figure.update_layout(legend=legend, height=150 * len(panels), hovermode="x")
     add_menu(figure, results, layouts)
     return figure
 
 
-def _draw(figure: go.Figure, scenario: int, result: Result, styles: Mapping[str, Style]) -> dict[str, Any]:
+def _draw(
+    figure: go.Figure, scenario: int, result: Result, styles: Mapping[str, Style], panels: Sequence[Panel]
+) -> dict[str, Any]:
     """Add the lines of a scenario and return the ranges of its panels: those of the crystals that were not lost."""
     samples, interval = chosen(result.samples, COLUMNS), result.row.control_interval
-    bias, step = ring_bias(result.row, result.seeds[0]), max(round(POINT / interval), 1)
+    by_length = result.row.process is CRYSTAL
+    bias = 0.0 if by_length else ring_bias(result.row, result.seeds[0])
+    step = max(round(POINT / interval), 1)
     time = {"x0": 0.5 * step * interval / MINUTE, "dx": step * interval / MINUTE}
     longest = max(map(example, samples), key=lambda signals: len(signals.r_c))
     whole = [sample.name for sample in samples if not lost(sample)] or [sample.name for sample in samples]
     layout: dict[str, Any] = {}
-    for number, panel in enumerate(PANELS):
+    for number, panel in enumerate(panels):
         ends = list(panel.levels)
         for name, function in panel.lines.items():
             for sample in samples if name in OWN else samples[:1]:
                 own = name in OWN
-                values = _points(function(example(sample) if own else longest, bias) / panel.scale, step)
+                signals = example(sample) if own else longest
+                values = _points(function(signals, bias) / panel.scale, step)
+                places = {"x": _points(signals.L / MM, step)[: len(values)]} if by_length else time
                 look = {"name": plain(sample.name) if own else name, "showlegend": False}
                 if own and not number and name == "true":
                     rmse = f"{sample.metric('rmse_mm')[0, 0]:.3f} mm{', lost' if lost(sample) else ''}"
@@ -168,7 +191,7 @@ def _draw(figure: go.Figure, scenario: int, result: Result, styles: Mapping[str,
                 style = styles[sample.name]
                 line = {"color": style.colour if own else INK, "width": 0.8 if name == "camera" else 1.5}
                 figure.add_scatter(
-                    row=number + 1, col=1, y=values, **time, **look, mode="lines",
+                    row=number + 1, col=1, y=values, **places, **look, mode="lines",
                     line={**line, "dash": "solid" if own else "dash"}, opacity=0.35 if name == "camera" else 1.0,
                     legendgroup=sample.name if own else name, meta=scenario,
                 )  # fmt: skip

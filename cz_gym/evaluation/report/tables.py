@@ -64,6 +64,17 @@ DRIVES = (
     RETURN,
     Column(SPEED, "compute [us/step]", 2),
 )
+SHORT = (
+    RMSE,
+    Column("max_error_mm", "max [mm]", 2, interval=False),
+    Column("within_half_mm", "in 0.5 mm [%]", 1, PERCENT, interval=False),
+    PULL_STEP._replace(heading="pull step [mm/min]", interval=False),
+    HEATER_STEP._replace(heading="heater step [kW]", interval=False),
+    FAILURES._replace(interval=False),
+    Column(SPEED, "compute [us/step]", 2),
+    RMSE._replace(heading=f"RMSE less {REFERENCE}'s [mm]", kind="paired"),
+)
+"""Columns on a terminal."""
 _COMPARISON = (
     RMSE._replace(heading="worst 5 % RMSE [mm]", kind="cvar5"),
     RMSE._replace(heading=f"RMSE less {REFERENCE}'s [mm]", kind="paired"),

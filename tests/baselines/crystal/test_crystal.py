@@ -39,7 +39,7 @@ def test_twelve_crowns(name, least, most, error):
 
 def test_filter_and_regulator_are_stable_at_every_length():
     at = design(make_config(process=CRYSTAL).parameters, HURLE, 5.0, 0.5, Noise(), Weights())
-    for A, B, C, K, F in zip(*at[1:], strict=True):
+    for A, B, C, K, F, _ in zip(*at[1:], strict=True):
         told = np.eye(STATES) - K @ C
         loop = np.block([[A, np.zeros((STATES, 2))], [np.zeros((2, STATES + 2))]]) + np.vstack([B, np.eye(2)]) @ F
         assert max(np.abs(np.linalg.eigvals(part)).max() for part in (told @ A, loop)) < 1.0

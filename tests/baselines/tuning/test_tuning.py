@@ -8,6 +8,7 @@ import pytest
 
 from cz_gym.baselines.lqg.controller import LQGDesign
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
+from cz_gym.baselines.tuning.crystal import CRYSTALS, SCENARIOS, STAGES, CrystalFigures, priced
 from cz_gym.baselines.tuning.lqg import ACTIVITIES, BEST_RETURN, FAMILY, LQGS, PARAMETERS, lqg_goal
 from cz_gym.baselines.tuning.pid import PIDS, pid_goal
 from cz_gym.baselines.tuning.record import Figures, Parameter, value_at
@@ -15,6 +16,7 @@ from cz_gym.baselines.tuning.search import Search, measure
 from cz_gym.baselines.tuning.values import TUNED, by_scenario, file_name
 from cz_gym.commands import tune
 from cz_gym.config import make_config
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.machine.puller import FOLDER
@@ -211,6 +213,21 @@ def test_shipped_settings_are_those_a_search_chose(tuned, scenario):
     assert found["scenario_hash"] == config.scenario.hash
 
 
+@pytest.mark.parametrize("tuned", CRYSTALS, ids=name)
+def test_controllers_of_whole_crystals_have_what_a_search_chose(tuned):
+    found = kept(tuned.name, "randomized")
+    config = make_config(SCENARIOS, process=CRYSTAL, stage=STAGES, **PLAIN)
+    search = Search(tuned.name, tuned.goal, config, 1, 5)
+    chosen = found["chosen"]["values"]
+    assert list(chosen) == [parameter.path for parameter in search.goal.parameters]
+    assert search.settings(chosen.values()).for_config(config) == tuned.make(config)
+    assert [*chosen.values()] in [tried for tried, *_ in found["history"]]
+    assert found["history"][0][0] == list(search.first)
+    assert found["scenario_hash"] == config.scenario.hash
+    figures = CrystalFigures(**found["chosen"]["figures"])
+    assert found["chosen"]["score"] == pytest.approx(priced(figures))
+
+
 @pytest.mark.parametrize("scenario", LQGS[-1].limits)
 def test_the_family_has_less_error_the_more_it_may_move(scenario):
     """But for the most active member on puller, where the drive limits the steps."""
@@ -247,6 +264,7 @@ def test_the_command_writes_what_the_search_chose(name, kind, trials, scenario, 
     [
         (["--controller", "nobody"], "unknown controller to tune 'nobody'"),
         (["--controller", "industrial", "--scenario", "moon"], "moon"),
+        (["--controller", "lqg-along", "--scenario", "hard"], "lqg-along has one search: leave --scenario hard out"),
         (["--controller", "lqg", "--scenario", "hard"], "lqg has no goal on 'hard', but on randomized"),
     ],
 )

@@ -1,0 +1,154 @@
+"""The tuned controllers of whole crystals: a record each.
+
+Their searches meet crowns, bodies and tails, and weigh the largest errors in the crown first: there
+the ring misleads most.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.baselines.crystal.lqg import CrystalLQG, Noise, Weights
+from cz_gym.baselines.crystal.pid import CrystalPID, TrueRadiusPID
+from cz_gym.baselines.pid.compensated_pid import SeriesPID
+from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
+from cz_gym.config import Config
+from cz_gym.episodes.scenarios import RANDOMIZED
+from cz_gym.evaluation.contender import Contender
+from cz_gym.evaluation.crystal_metrics import Floats, crystal_metrics
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
+
+from .record import Goal, Parameter
+from .values import by_scenario, with_values
+
+STAGES = {"crown": 0.6, "body": 0.2, "tail": 0.2}
+"""Shares of the stages among the crystals of a search."""
+SCENARIOS = {"randomized": 0.5, "hard": 0.5}
+"""Shares of the scenarios: on ``hard`` it shows within few crystals which settings lose some."""
+WORST = 0.25
+"""Share of the crystals, those with the largest errors, whose mean error counts [-]."""
+OUTSIDE_PRICE, STEP_PRICE, FAILURE_PRICE = 10.0, 5.0, 100.0
+"""Prices of a body that is all off by more than 0.5 mm [mm], of the pull step RMS [mm per mm/min], and of losing every
+crystal [mm]."""
+HEATER = TemperatureLoop(K=1500.0, T_i=300.0, K_pull=10.0, T_pull=2000.0, T_mean=300.0)
+"""The heater's loop on the recipe, trimmed where the mean pull speed is off the recipe's."""
+CONVENTIONAL = SeriesPID(K_p=0.0018, T_i=2000.0, T_d=1069.0, N=25.0)
+"""Gains of ``pid-conventional`` of ``Cz-v0``, which needs no compensator, with a slower integrator."""
+COMPENSATED = SeriesPID(K_p=0.008, T_i=1500.0, T_d=800.0, N=12.0)
+"""Gains near those of the paper, with a slower derivative filter."""
+LOOP = (
+    Parameter("pid.K_p", 3e-4, 5e-2),
+    Parameter("pid.T_i", 300.0, 3.0 * HOUR),
+    Parameter("pid.T_d", 30.0, 3000.0),
+    Parameter("pid.N", 2.0, 100.0),
+    Parameter("T_f", 2.0, 300.0),
+    Parameter("cone_gain", 0.01, 2.0),
+    Parameter("heater.K", 300.0, 3000.0),
+    Parameter("heater.K_pull", 1.0, 300.0),
+    Parameter("heater.T_pull", 3.0 * MINUTE, 3.0 * HOUR),
+    Parameter("heater.T_mean", 10.0, 0.5 * HOUR),
+)
+COMPENSATOR = (Parameter("lam", 0.0, 1.0, log=False), Parameter("slow", 1e-5, 1e-2))
+DESIGN = (
+    Parameter("noise.ring", 0.01 * MM, 0.5 * MM),
+    Parameter("noise.height", 1e-6, 1e-3),
+    Parameter("noise.cones", 0.3, 10.0),
+    Parameter("noise.recipe", 0.1, 30.0),
+    Parameter("weights.height", 0.03 * MM, 3.0 * MM),
+    Parameter("weights.pull", 0.01 * MM_PER_MIN, 3.0 * MM_PER_MIN),
+)
+
+
+class CrystalFigures(NamedTuple):
+    """Figures of crowns, bodies and tails."""
+
+    crown_mm: float
+    """Mean of the crown's largest errors in the :data:`WORST` crystals [mm]."""
+    tail_mm: float
+    """The same of the tail [mm]."""
+    body_outside: float
+    """Share of the body's length with an error beyond 0.5 mm [-]."""
+    pull_step: float
+    """Pull step RMS [mm/min]."""
+    failure_rate: float
+
+
+def measure(policy: Any, config: Config, seeds: Sequence[int]) -> CrystalFigures:
+    """Run a controller on those crystals; figures have six digits, as in the history."""
+    m = crystal_metrics(rollout(policy, config, seeds))
+    inside, steps = np.nanmean(m.body_within_half), m.pull_step_rms_mm_per_min.mean()
+    values = _worst(m.crown_max_mm), _worst(m.tail_max_mm), 1.0 - inside, steps, m.failure_rate.mean()
+    return CrystalFigures._make(float(f"{value:.6g}") for value in values)
+
+
+def _worst(errors: Floats) -> float:
+    """Mean of the largest errors [mm]."""
+    known = np.sort(errors[~np.isnan(errors)])
+    return float(known[-max(round(WORST * len(known)), 1) :].mean())
+
+
+def priced(figures: CrystalFigures) -> float:
+    """The objective of a search: the largest errors of crown and tail, plus what the rest is worth [mm]."""
+    rest = OUTSIDE_PRICE * figures.body_outside + STEP_PRICE * figures.pull_step
+    return figures.crown_mm + 0.5 * figures.tail_mm + rest + FAILURE_PRICE * figures.failure_rate
+
+
+@dataclass(frozen=True, kw_only=True)
+class TunedCrystal:
+    """A tuned controller of whole crystals: its start, the numbers that were searched, its row in tables."""
+
+    name: str
+    meaning: str
+    start: CrystalPID | CrystalLQG
+    """Settings before the search."""
+    parameters: tuple[Parameter, ...]
+    quoted: bool = False
+
+    @property
+    def goal(self) -> Goal:
+        """The goal of its search."""
+        return Goal(self.start, self.parameters, (), priced, (), FAILURE_PRICE, 0.0, CrystalFigures)
+
+    def make(self, config: Config) -> CrystalPID | CrystalLQG:
+        """The controller for an environment, with the settings that were chosen."""
+        chosen = by_scenario(self.name).get(RANDOMIZED.name, {})
+        settings: CrystalPID | CrystalLQG = with_values(self.start, chosen)
+        return settings.for_config(config)
+
+    @property
+    def contender(self) -> Contender:
+        """The controller as a row of the benchmark."""
+        return Contender(self.name, self.make, "measured", self.meaning, quoted=self.quoted)
+
+
+RING_PID = CrystalPID(pid=CONVENTIONAL, compensates=False, T_f=10.0, heater=HEATER)
+TRUE_PID = TrueRadiusPID(pid=SeriesPID(N=10.0), heater=HEATER)
+CRYSTALS = (
+    TunedCrystal(
+        name="ring-pid-reduced",
+        meaning="the same with smaller gains in crown and tail",
+        start=CrystalPID(pid=CONVENTIONAL, compensates=False, T_f=10.0, cone_gain=0.15, heater=HEATER),
+        parameters=LOOP,
+    ),
+    TunedCrystal(
+        name="compensated",
+        meaning="PID on the ring less the height that the paper's compensator predicts along the recipe",
+        start=CrystalPID(pid=COMPENSATED, lam=0.1, slow=1.0e-3, cone_gain=0.15, heater=HEATER),
+        parameters=(*LOOP, *COMPENSATOR),
+        quoted=True,
+    ),
+    TunedCrystal(
+        name="lqg-along",
+        meaning="Kalman filter and regulator designed along the recipe",
+        start=CrystalLQG(
+            noise=Noise(height=1.5e-5, cones=2.0, temperature=2e-3, fluctuation=0.3, tau=600.0, drift=5.0),
+            weights=Weights(radius=0.4 * MM, height=0.3 * MM, pull=0.1 * MM_PER_MIN, power_step=1.6 * KILO),
+        ),
+        parameters=DESIGN,
+        quoted=True,
+    ),
+)
+"""Every tuned controller of whole crystals, in the order of tables."""
