@@ -39,7 +39,13 @@ def test_a_crystal_without_end_over_a_charge_without_end_is_the_body(lam, rng):
     )  # fmt: skip
     u = Inputs(rng.uniform(0, 4e-5, n), q.Q_H_0 + rng.uniform(-1e4, 1e4, n))
     Q_d, dT_i = rng.normal(0, 1000, n), rng.normal(0, 1, n)
-    here = rates(State(*x, 1.0, 1e9, 0.0, 1.0), u, Disturbance(Q_d, dT_i), p, HURLE)
+    each = (map(float, numbers) for numbers in zip(*x, *u, Q_d, dT_i, strict=True))
+    found = [
+        rates(State(r_c, h_c, *T, 1.0, 1e9, 0.0, 1.0), Inputs(v_p, Q_H), Disturbance(*load), p, HURLE)
+        for r_c, h_c, *T, v_p, Q_H, Q, dT in each
+        for load in [(Q, dT)]
+    ]
+    here = np.array(found).T
     there = body.rates(x, u, body.Disturbance(Q_d, dT_i, melt_left(0.0, EPISODE)), q, hurle_slope)
     for mine, bodys in zip(here, there, strict=False):
         np.testing.assert_allclose(mine, bodys, rtol=1e-12, atol=1e-12 * np.abs(bodys).max())
