@@ -3,8 +3,6 @@
 The source folder is the repository, so that README, docs and results link to each other by their own paths.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

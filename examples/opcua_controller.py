@@ -23,7 +23,8 @@ from cz_gym.errors import CzError
 from cz_gym.machine.export.compiled import CompiledBlock
 from cz_gym.machine.export.controllers import make_block
 from cz_gym.machine.export.policy import Runner
-from cz_gym.machine.serve.machine import SETPOINTS, TAGS
+from cz_gym.machine.export.ports import SETPOINTS
+from cz_gym.machine.serve.machine import TAGS
 from cz_gym.machine.serve.opcua import URI, WRITABLE, certify, password
 from cz_gym.support.command_line import OneLineParser, between
 

@@ -5,8 +5,6 @@ its setpoints are compared with Python's at every sample. Closed loop: the C gro
 of the table stands beside Python's.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys
@@ -32,8 +30,8 @@ from cz_gym.support.command_line import OneLineParser
 
 CONTROLLERS = ("paper", "paper-tuned", "lqg-at-0.02", "gradient", "ppo")
 SCENARIOS = ("randomized", "hard", "sensor-fault", "puller")
-CRYSTALS, QUICK = 100, 4
-"""Crystals of a row, also of a quick run."""
+CRYSTALS = 100
+"""Crystals of a row."""
 LARGEST = {"double": 1e-9, "float": 1e-4}
 """Largest difference of an action that counts as the same, in shares of the drives' ranges."""
 
@@ -47,8 +45,9 @@ class Row(NamedTuple):
     difference: float
     """Largest difference of an action from Python's on the same readings, in shares of the drives' ranges."""
     python: Sequence[float]
-    """Of the table: RMSE [mm], pull step RMS [mm/min], both rounded as there; crystals lost."""
+    """Python's row of the table: RMSE [mm] and pull step RMS [mm/min], rounded as there; crystals lost."""
     c: Sequence[float]
+    """The same row with the C."""
     rounded: Sequence[float] | None = None
     """Where the row differs: that of C in double precision whose setpoints alone are rounded to single precision."""
 
@@ -128,20 +127,19 @@ single precision: so much the loop of crystal and controller makes of the sevent
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser("python -m studies.export", "Exported C beside Python on validation crystals.")
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK} crystals a row")
     parser.add_argument("--out", type=Path, default=Path("results/export"), metavar="FOLDER", help="%(default)s")
     return parser.run(_main, arguments, "benchmark")
 
 
 def _main(given: argparse.Namespace) -> None:
     check_writable(given.out)
-    crystals, rows = QUICK if given.quick else CRYSTALS, list[Row]()
+    rows = list[Row]()
     for controller in CONTROLLERS:
         for scenario in SCENARIOS:
-            rows += study(controller, scenario, crystals)
+            rows += study(controller, scenario, CRYSTALS)
             print(*rows[-1], flush=True)
-    text = json.dumps({"crystals": crystals, "rows": [row._asdict() for row in rows]}, indent=1)
-    write_files({given.out / "export.json": text.encode(), given.out / "report.md": report(rows, crystals).encode()})
+    text = json.dumps({"crystals": CRYSTALS, "rows": [row._asdict() for row in rows]}, indent=1)
+    write_files({given.out / "export.json": text.encode(), given.out / "report.md": report(rows, CRYSTALS).encode()})
 
 
 if __name__ == "__main__":

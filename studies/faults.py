@@ -5,8 +5,6 @@ pyrometer that is gone for two hours, nominal values that are off, drives that s
 of the block's interval, and the ring's time is that of its frame.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -26,15 +24,16 @@ from cz_gym.machine.export.policy import BlockPolicy, Runner
 from cz_gym.machine.export.ports import Alarm
 from cz_gym.machine.export.shell import Block
 from cz_gym.support.atomic_files import check_writable, write_files
-from cz_gym.support.command_line import OneLineParser, between
+from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.units import HOUR, MINUTE, MM
 
+CONTROLLERS, CRYSTALS = ("lqg-at-0.02", "paper-tuned", "fallback"), 100
 GONE = 0.5 * HOUR, 2.5 * HOUR
 """When a pyrometer is gone [s]."""
 STILL = 1.0 * HOUR, 1.0 * HOUR + 10.0 * MINUTE
 """When the drives stand still [s]."""
 OFF = {"nominal_heater_power_kW": 2.0, "nominal_T_1_K": 10.0, "nominal_radius_mm": 0.2}
-"""What nominal values are off by."""
+"""Errors of the nominal values."""
 SETTLED = 0.5 * HOUR
 """Time from which errors count [s]."""
 
@@ -45,7 +44,7 @@ class Fault(NamedTuple):
     pace: Sequence[float] = (1.0,)
     """Times between calls in intervals of the block, multiples of a half, over and over."""
     pyrometer: Callable[[Any, Any], Any] | None = None
-    """Its reading while it is gone, from the true one and the last one before."""
+    """The pyrometer's reading while it is gone, from the true one and the last one before."""
     off: float = 0.0
     """Error of the nominal values, in multiples of OFF."""
     still: bool = False
@@ -108,7 +107,7 @@ class Row(NamedTuple):
     """A controller under a fault."""
 
     rmse: float
-    """From half an hour on, of the crystals that were kept [mm]."""
+    """Radius error from half an hour on, of the crystals that were not lost [mm]."""
     lost: int
     helpless: int
     """How many of them were lost while the drives stood still."""
@@ -127,15 +126,15 @@ def grow(block: Block, fault: str, crystals: int, runner: Runner | None = None, 
     return Row(float(np.sqrt(np.mean(np.square(error)))), len(ends), int(helpless.sum()), Alarm(faulty.bits))
 
 
-def report(rows: Mapping[tuple[str, str, str], Row], crystals: int) -> str:
-    """The table."""
+def report(rows: Mapping[tuple[str, str], Row], crystals: int) -> str:
+    """The table, by controller and fault."""
     lines = []
-    for (controller, language, fault), row in rows.items():
-        share = row.rmse / rows[controller, language, "none"].rmse
+    for (controller, fault), row in rows.items():
+        share = row.rmse / rows[controller, "none"].rmse
         lost = f"{row.lost} ({row.helpless})" if row.helpless else str(row.lost)
         names = ", ".join(bit.name or "" for bit in row.alarms)
-        lines.append((controller, language, fault, f"{row.rmse:.3f}", f"{share:.2f}", lost, names))
-    heads = "controller", "language", "fault", "RMSE [mm]", "of none", "lost", "alarms"
+        lines.append((controller, fault, f"{row.rmse:.3f}", f"{share:.2f}", lost, names))
+    heads = "controller", "fault", "RMSE [mm]", "of none", "lost", "alarms"
     return f"""# Blocks under the faults of a plant
 
 {crystals} test crystals of three hours each, errors from half an hour on, of those that were kept. In brackets: those
@@ -147,33 +146,21 @@ of the lost that were lost while the drives stood still, when no block acts.
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser("python -m studies.faults", "Blocks under the faults of a plant.")
-    add = parser.add_argument
-    parser.add_puller("its drives, its camera")
-    add(
-        "--controllers",
-        nargs="+",
-        default=["lqg-at-0.02", "paper-tuned", "fallback"],
-        metavar="NAME",
-        help="%(default)s",
-    )
-    add("--faults", nargs="+", choices=FAULTS, default=list(FAULTS), help="all unless given")
-    add("--crystals", type=between(1, 100), default=100, metavar="N", help="%(default)s")
-    add("--python", action="store_true", help="the blocks in Python, in place of their compiled C")
-    add("--out", type=Path, default=Path("results/faults"), metavar="FOLDER", help="%(default)s")
+    parser = OneLineParser("python -m studies.faults", "Blocks in compiled C under the faults of a plant.")
+    parser.add_argument("--out", type=Path, default=Path("results/faults"), metavar="FOLDER", help="%(default)s")
     return parser.run(_main, arguments, "plant")
 
 
 def _main(given: argparse.Namespace) -> None:
     check_writable(given.out)
-    config, rows = make_config("puller", observation="measured", action="direct", puller=given.puller), {}
-    for name in given.controllers:
-        block = make_block(name, config)
-        runner: Runner = block if given.python else CompiledBlock(block)
-        for fault in dict.fromkeys(["none", *given.faults]):
-            rows[name, "Python" if given.python else "C", fault] = row = grow(block, fault, given.crystals, runner)
-            print(name, fault, *row, flush=True)
-    write_files({given.out / "report.md": report(rows, given.crystals).encode()})
+    rows: dict[tuple[str, str], Row] = {}
+    for name in CONTROLLERS:
+        block = make_block(name, make_config("puller", observation="measured", action="direct"))
+        runner = CompiledBlock(block)
+        for fault in FAULTS:
+            rows[name, fault] = grow(block, fault, CRYSTALS, runner)
+            print(name, fault, *rows[name, fault], flush=True)
+    write_files({given.out / "report.md": report(rows, CRYSTALS).encode()})
 
 
 if __name__ == "__main__":

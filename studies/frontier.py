@@ -36,18 +36,18 @@ Means = Mapping[str, Mapping[str, Estimate]]
 """Estimates of the benchmark by controller and metric."""
 
 
-def ranking(means: Means, found: Mapping[str, float]) -> str:
-    """Sentences: how well the return ranks the controllers that are no bounds as the ratios ``found`` do."""
-    names = [name for name in found if name not in BOUNDS]
+def ranking(means: Means, ratio: Mapping[str, float]) -> str:
+    """Sentences that say how well the return ranks the controllers that are no bounds, compared with their ratios."""
+    names = [name for name in ratio if name not in BOUNDS]
     others = [name for name in names if name not in FAMILY]
     if len(others) < 3:
         return ""
     ranked, with_family = (
-        -spearmanr([means[name][RETURN].mean for name in each], [found[name] for name in each]).statistic
+        -spearmanr([means[name][RETURN].mean for name in each], [ratio[name] for name in each]).statistic
         for each in (others, names)
     )
-    apart = [pair for pair in combinations(names, 2) if abs(np.log(found[pair[0]] / found[pair[1]])) > np.log(APART)]
-    alike = sum((found[a] > found[b]) == (means[a][RETURN].mean < means[b][RETURN].mean) for a, b in apart)
+    apart = [pair for pair in combinations(names, 2) if abs(np.log(ratio[pair[0]] / ratio[pair[1]])) > np.log(APART)]
+    alike = sum((ratio[a] > ratio[b]) == (means[a][RETURN].mean < means[b][RETURN].mean) for a, b in apart)
     return (
         f"Spearman's correlation of return and ratio, with its sign turned: {ranked:.2f} over the {len(others)} "
         f"controllers outside the reference family, {with_family:.2f} with its members, whose ratios are 1 by "

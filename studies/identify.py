@@ -37,15 +37,14 @@ from cz_gym.support.atomic_files import check_writable, write_files
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.units import KILO, MM, PERCENT
 
-PULLERS, CRYSTALS, QUICK = 20, 20, 3
-"""Pullers, crystals of each, pullers of a quick run."""
+PULLERS, CRYSTALS = 20, 20
+"""Number of pullers, and of crystals of each."""
 HOT_ZONE, MELT = ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b", "eps"), ("sigma", "k_l")
 """What the start file has wrong by PRIOR_SD, and by MELT_SD."""
 MELT_SD = 0.1
 """Standard deviation of the logarithm of the melt's numbers in handbooks [-]."""
-SCENARIO = replace(
-    RANDOMIZED, name="randomized, one puller", pullers=Pullers(RANDOMIZED.pullers.mix, start_radius_sd=0.2 * MM)
-)
+ONE = Pullers(RANDOMIZED.pullers.mix, start_radius_sd=0.2 * MM)
+SCENARIO = replace(RANDOMIZED, name="randomized, one puller", pullers=ONE)
 """The scenario ``randomized`` without its spread of pullers."""
 
 
@@ -81,12 +80,9 @@ def draw(number: int) -> tuple[PullerFile, PullerFile]:
     area = (r_0 / default.r_0) ** 2
     size = area * 2.0 ** random.uniform(-1.0, 1.0)
     scaled = dict.fromkeys(("C_1", "C_2", "C_b"), size) | dict.fromkeys(("kappa_12", "G_1a", "G_2b"), area)
-    start = default._replace(
-        r_0=r_0,
-        v_0=default.v_0 * random.uniform(0.7, 1.3) * (default.r_0 / r_0) ** 0.5,
-        R_cr=3.2 * r_0,
-        **{name: factor * getattr(default, name) for name, factor in scaled.items()},
-    )
+    v_0 = default.v_0 * random.uniform(0.7, 1.3) * (default.r_0 / r_0) ** 0.5
+    hot_zone = {name: factor * getattr(default, name) for name, factor in scaled.items()}
+    start = default._replace(r_0=r_0, v_0=v_0, R_cr=3.2 * r_0, **hot_zone)
     truth = {name: getattr(start, name) * factor for name, factor in wrong(random).items()}
     file = PullerFile(f"puller {number}", start, heater_range=area * HEATER_RANGE)
     return file, replace(file, parameters=start._replace(**truth))
@@ -128,17 +124,12 @@ def study(number: int, crystals: int) -> Row:
 def report(rows: Sequence[Row]) -> str:
     """The table and what follows from it."""
     heads = "diameter [mm]", "heater [kW]", "told", "inside", "LQG told truth [mm]", "identified", "start", "lost"
-    lines = [
-        (
-            f"{2.0 * row.truth.parameters.r_0 / MM:.0f}",
-            f"{make_puller(row.truth.parameters).Q_H_0 / KILO:.0f}",
-            str(len(row.inside)),
-            str(sum(row.inside)),
-            *(f"{error:.3f}" for error in row.rmse_mm),
-            ", ".join(map(str, row.lost)),
-        )
-        for row in rows
-    ]
+    lines = []
+    for row in rows:
+        parameters, errors = row.truth.parameters, (f"{error:.3f}" for error in row.rmse_mm)
+        machine = f"{2.0 * parameters.r_0 / MM:.0f}", f"{make_puller(parameters).Q_H_0 / KILO:.0f}"
+        told = str(len(row.inside)), str(sum(row.inside))
+        lines.append((*machine, *told, *errors, ", ".join(map(str, row.lost))))
     ratios = [row.rmse_mm[1] / row.rmse_mm[0] for row in rows]
     inside, lost = np.concatenate([row.inside for row in rows]), np.sum([row.lost for row in rows], axis=0)
     ratio = f"median {np.median(ratios):.3f}, worst {max(ratios):.3f}"
@@ -154,7 +145,6 @@ without excitation, logs that are said to tell the pull speed's path: {sum(row.p
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser("python -m studies.identify", "Identify pullers that nobody knows.")
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK} pullers, 4 crystals each")
     parser.add_argument("--out", type=Path, default=Path("results/identify"), metavar="FOLDER", help="%(default)s")
     return parser.run(_main, arguments, "benchmark")
 
@@ -162,8 +152,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(given: argparse.Namespace) -> None:
     check_writable(given.out)
     rows: list[Row] = []
-    for number in range(QUICK if given.quick else PULLERS):
-        rows.append(study(number, 4 if given.quick else CRYSTALS))
+    for number in range(PULLERS):
+        rows.append(study(number, CRYSTALS))
         write_files({given.out / "pullers.txt": report(rows).encode()})
         print(f"puller {number}: RMSE {', '.join(f'{error:.3f}' for error in rows[-1].rmse_mm)} mm", flush=True)
     print(report(rows), end="")

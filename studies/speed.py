@@ -190,19 +190,19 @@ def measure(wanted: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, A
     skipped = {}
     for name, make in wanted.items():
         try:
-            made = stepper(make())
-            made.step()
+            timed = stepper(make())
+            timed.step()
         except Exception as error:  # a missing or broken peer must not end the run
             skipped[name] = f"{type(error).__name__}: {' '.join(str(error).split())}"[:100]
             continue
-        timer = timeit.Timer(made.step, "import gc; gc.enable()")
-        running[name] = made, timer, timer.autorange()[0]
+        timer = timeit.Timer(timed.step, "import gc; gc.enable()")
+        running[name] = timed, timer, timer.autorange()[0]
     speeds: dict[str, list[float]] = {name: [] for name in running}
     for _ in tqdm(range(rounds), desc="rounds", disable=None):
-        for name, (made, timer, calls) in running.items():
-            speeds[name].append(calls * made.num_envs / timer.timeit(calls))
-    for made, *_ in running.values():
-        made.close()
+        for name, (timed, timer, calls) in running.items():
+            speeds[name].append(calls * timed.num_envs / timer.timeit(calls))
+    for timed, *_ in running.values():
+        timed.close()
     medians = {name: statistics.median(values) for name, values in speeds.items()}
     rows = [
         {"name": name, "num_envs": running[name][0].num_envs, "steps_per_s": speed} for name, speed in medians.items()

@@ -19,12 +19,12 @@ ZONE = {
 }  # fmt: skip
 """A puller of 200 mm crystals [SI]."""
 QUIRKS = {
-    "interval": 2.0, "feels": True, "heater_lag": 0.0, "heater_dead_time": 0.0, "heater_slew": math.inf,
+    "interval": 2.0, "heater_lag": 0.0, "heater_dead_time": 0.0, "heater_slew": math.inf,
     "heater_step": 0.0, "pull_slew": math.inf, "pull_window": math.inf, "pyrometer_filter": 0.0,
     "pyrometer_noise": 0.1, "camera_noise": 0.03, "camera_latency": 0.0, "camera_scale": 1.0, "level_drift": 0.0,
 }  # fmt: skip
 """What the machine does: [s], [K], heater in [W] and [W/s], pull in [mm/min] and [mm/min per s], camera in [mm], level
-in [mm/h] of the ring; ``feels``: whether the heat that the crystal draws changes with it."""
+in [mm/h] of the ring."""
 REACH, MELT = 1e4, ((30.0, 0.25), (780.0, 0.25))
 """The heater's range about nominal [W]; times [s] and deviations [K] of the melt's fluctuations."""
 COLUMNS = "time_s", "ring_radius_mm", "pull_speed_mm_per_min", "heater_power_kW", "T_1_K"
@@ -41,8 +41,8 @@ class ForeignPuller:
         self.a2, self.rho_dH = 2 * z.sigma / z.rho_l / z.g, z.rho_s * z.dH
         self.h_0, melt = self._height(z.alpha_0, z.r_0), z.T_m + z.dT_0
         flux = z.k_l * z.dT_0 / self.h_0
-        self.solid_flux, self.draw_0 = self.rho_dH * z.v_0 + flux, math.pi * z.r_0**2 * flux
-        through = self._loss(z.r_0, melt) + self.draw_0
+        self.solid_flux = self.rho_dH * z.v_0 + flux
+        through = self._loss(z.r_0, melt) + math.pi * z.r_0**2 * flux
         T_2 = melt + through / z.G_2b
         self.T_1_0 = (T_2**4 + through / z.kappa_12) ** 0.25
         self.power_0 = through + z.G_1a * (self.T_1_0 - z.T_a)
@@ -84,12 +84,11 @@ class ForeignPuller:
         z, (r, h, T_1, T_2, T_b) = self.z, x
         flux = z.k_l * (T_b + sum(self.fluctuation) - z.T_m) * (z.lam / h + (1 - z.lam) / self.h_0)
         growth, radiated = (self.solid_flux - flux) / self.rho_dH, z.kappa_12 * (T_1**4 - T_2**4)
-        draw, wide = (math.pi * r * r * flux, r) if self.q.feels else (self.draw_0, z.r_0)
         wall = z.G_2b * (T_2 - T_b)
         return np.array([
             growth * math.tan(self._angle(h, r) - z.alpha_0), self.pull - growth,
             (self.heat - radiated - z.G_1a * (T_1 - z.T_a)) / z.C_1, (radiated - wall) / z.C_2,
-            (wall - self._loss(wide, T_b) - draw) / z.C_b,
+            (wall - self._loss(r, T_b) - math.pi * r * r * flux) / z.C_b,
         ])  # fmt: skip
 
     def _frame(self):

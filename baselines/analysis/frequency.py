@@ -74,14 +74,9 @@ def loop_margins(
     # A delay also turns a real loop gain above one at the Nyquist frequency to the critical point's side.
     nyquist = np.mod(np.angle(values[-1:]) + np.pi, 2.0 * np.pi) * dt / np.pi
     late = np.append(np.radians(np.mod(phase, 360.0)) / crossing, nyquist[np.abs(values[-1:]) > 1.0])
-    return LoopMargins(
-        crossover,
-        _pick(gain[gain > 1.0], np.min),
-        _pick(gain[gain < 1.0], np.max),
-        _pick(np.abs(phase), np.min),
-        _pick(late, np.min),
-        float(np.max(1.0 / np.abs(1.0 + values))),
-    )
+    gains = _pick(gain[gain > 1.0], np.min), _pick(gain[gain < 1.0], np.max)
+    sensitivity = float(np.max(1.0 / np.abs(1.0 + values)))
+    return LoopMargins(crossover, *gains, _pick(np.abs(phase), np.min), _pick(late, np.min), sensitivity)
 
 
 def _pick(values: Any, which: Any) -> float:

@@ -62,14 +62,9 @@ def _lqg(policy: LQG, sensor: Sensor) -> LinearForm:
         _, state = linear.predict(observation, state)
     assert state is not None
     readings = map_arrays(np.zeros_like, state.readings)
-    settled, memory = state.memory.filter, state.memory
-    still = memory._replace(
-        filter=settled._replace(mean=0.0 * settled.mean), plan=0.0 * memory.plan, command=0.0 * memory.command
-    )
-    controller = linear_controller(
-        linear,
-        (policy.v_0, policy.heater_range),
-        state._replace(readings=readings, memory=still),
-        ("memory.filter.mean", "memory.command"),
-    )
+    memory, moving = state.memory, ("memory.filter.mean", "memory.command")
+    settled = memory.filter._replace(mean=0.0 * memory.filter.mean)
+    still = memory._replace(filter=settled, plan=0.0 * memory.plan, command=0.0 * memory.command)
+    rest = state._replace(readings=readings, memory=still)
+    controller = linear_controller(linear, (policy.v_0, policy.heater_range), rest, moving)
     return LinearForm(controller, controller, policy.control_interval)

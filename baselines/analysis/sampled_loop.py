@@ -22,7 +22,7 @@ from cz_gym.errors import CzError
 from cz_gym.observation import MEASURED, PULL_SCALE, Measured, scales
 from cz_gym.physics.linearisation import StateSpace
 from cz_gym.physics.parameters import Parameters
-from cz_gym.support.nested import map_arrays
+from cz_gym.support.nested import leaves, map_arrays
 
 _SMALL = 1e-6
 """Observed amplitude below every limit, gate and dead zone [-]; float32 actions keep their relative precision."""
@@ -66,10 +66,6 @@ class Loop(NamedTuple):
         return StateSpace(self.A, self.B[:, columns], self.C[[row]], self.D[np.ix_([row], columns)])
 
 
-class _Nothing(NamedTuple):
-    """The memory of a controller without memory."""
-
-
 def linear_controller(
     policy: Any,
     ranges: tuple[float, float] = (PULL_SCALE, HEATER_RANGE),
@@ -85,8 +81,8 @@ def linear_controller(
     """
     channels, name = len(MEASURED), type(policy).__name__
     rest = policy.predict(_AT_REST[None])[1] if rest is None else rest
-    rest = _Nothing() if rest is None else rest
-    if not hasattr(rest, "_fields"):
+    rest = () if rest is None else rest
+    if not isinstance(rest, tuple):
         raise NotLinearError(f"{name} has a memory that is no named tuple of arrays, so it has no state space here")
     parts = _parts(rest)
     if free is None:
@@ -103,19 +99,13 @@ def linear_controller(
     gains = once.T / _SMALL
     gains[:, memory:] /= scales(MEASURED, *ranges)
     gains[memory:] *= np.array(ranges)[:, None]
-    return StateSpace(
-        gains[:memory, :memory], gains[:memory, memory:], gains[memory:, :memory], gains[memory:, memory:]
-    )
+    (A, B), (C, D) = (np.split(rows, [memory], axis=1) for rows in np.split(gains, [memory]))
+    return StateSpace(A, B, C, D)
 
 
-def _parts(memory: Any, name: str = "") -> dict[str, Floats]:
+def _parts(memory: Any) -> dict[str, Floats]:
     """The arrays of a memory's first slot, by their names in the nested tuple."""
-    if not isinstance(memory, tuple):
-        return {name: np.asarray(memory, np.float64)[:1]}
-    parts: dict[str, Floats] = {}
-    for field, part in zip(memory._fields, memory, strict=True):  # type: ignore[attr-defined]
-        parts |= _parts(part, f"{name}.{field}" if name else field)
-    return parts
+    return {name: np.asarray(part, np.float64)[:1] for name, part in leaves(memory, ".").items()}
 
 
 def _answer(policy: Any, probes: Floats, rest: Any, free: Sequence[str]) -> Floats:
@@ -164,13 +154,9 @@ def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -
     own[:n, :n], disturbed[:n, :2], disturbed[n, 0] = plant.A, plant.B, 1.0
     moved = np.hstack([own, np.zeros((n + 2, len(controller.A)))]) + apply @ command
     ring = np.hstack([plant.C[:1], np.zeros((1, command.shape[1] - n))])
-    return Loop(
-        np.vstack([moved, np.hstack([B @ seen, controller.A])]),
-        np.vstack([disturbed + apply @ direct, B @ noise]),
-        np.vstack([command, ring]),
-        np.vstack([direct, np.zeros((1, inputs))]),
-        dt,
-    )
+    own, disturbed = np.vstack([moved, np.hstack([B @ seen, controller.A])]), disturbed + apply @ direct
+    direct = np.vstack([direct, np.zeros((1, inputs))])
+    return Loop(own, np.vstack([disturbed, B @ noise]), np.vstack([command, ring]), direct, dt)
 
 
 def stable_range(

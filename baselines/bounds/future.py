@@ -68,14 +68,9 @@ def future_of(config: Config, seeds: Sequence[int]) -> Future:
     e, dT_i = stack(drawn), np.stack([each.interface for each in series], axis=1)
     on_grid = disturbance(np.arange(points)[:, None] * GRID, dT_i, e, puller)
     end = np.arange(1, config.steps + 1)[:, None] * config.control_interval
-    return Future(
-        puller,
-        puller.state_0._replace(r_c=puller.r_0 + e.r_c_start),
-        puller.r_0 + reference(end, e) - bias_offset(end, e),
-        tuple(Disturbance(*(np.asarray(value)[column] for value in on_grid)) for column in point.T),
-        length.T[:, :, None],
-        config.meniscus,
-    )
+    start, target = puller.state_0._replace(r_c=puller.r_0 + e.r_c_start), puller.r_0 + reference(end, e)
+    held = tuple(Disturbance(*(np.asarray(value)[column] for value in on_grid)) for column in point.T)
+    return Future(puller, start, target - bias_offset(end, e), held, length.T[:, :, None], config.meniscus)
 
 
 def substeps_of(interval: float, steps: int) -> tuple[npt.NDArray[np.int64], Floats]:

@@ -16,8 +16,7 @@ import numpy as np
 
 from cz_gym.body.signals import Logged
 from cz_gym.evaluation.contender import Contender
-from cz_gym.jit.cache import PACKAGE, compiled_sources
-from cz_gym.jit.code_hash import hash_files
+from cz_gym.jit.cache import PACKAGE, compiled_sources, hash_files
 from cz_gym.support.atomic_files import write_files
 
 from .files import EPISODES, read_episodes, software

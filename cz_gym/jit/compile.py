@@ -225,31 +225,15 @@ def column(kind: Any, array: Any, at: Any, lane: Any) -> Any:
     return kind(*(array[at + row, lane] for row in range(len(kind._fields))))
 
 
-@compiled_as(column)
-def _column(kind: Any, *_: Any) -> Any:
-    fields = kind.instance_class._fields
-    return [f"return kind({', '.join(f'{name}=array[at + {row}, lane]' for row, name in enumerate(fields))})"], {}
-
-
 def set_column(kind: Any, values: Any, array: Any, at: Any, lane: Any) -> None:
     """Write the fields of a named tuple, or of a record with the same ones, to a column of an array."""
     for row, name in enumerate(kind._fields):
         array[at + row, lane] = getattr(values, name)
 
 
-@compiled_as(set_column)
-def _set_column(kind: Any, *_: Any) -> Any:
-    return [f"array[at + {row}, lane] = values.{name}" for row, name in enumerate(kind.instance_class._fields)], {}
-
-
 def labelled(kind: Any, record: Any) -> Any:
     """Read a named tuple of this kind from a record that has its fields."""
     return kind(*(getattr(record, name) for name in kind._fields))
-
-
-@compiled_as(labelled)
-def _labelled(kind: Any, record: Any) -> Any:
-    return [f"return kind({', '.join(f'record.{name}' for name in kind.instance_class._fields)})"], {}
 
 
 def joined(kind: Any, first: Any, second: Any) -> Any:
@@ -269,9 +253,19 @@ def set_labelled(kind: Any, values: Any, record: Any) -> None:
         setattr(record, name, getattr(values, name))
 
 
-@compiled_as(set_labelled)
-def _set_labelled(kind: Any, *_: Any) -> Any:
-    return [f"record.{name} = values.{name}" for name in kind.instance_class._fields], {}
+def _by_field(function: Any, text: str, returns: bool) -> None:
+    """Compile a function of a class of named tuples to this text for each of the fields, as statements or arguments."""
+
+    @compiled_as(function)
+    def write(kind: Any, *_: Any) -> Any:
+        parts = [text.format(name=name, row=row) for row, name in enumerate(kind.instance_class._fields)]
+        return ([f"return kind({', '.join(parts)})"] if returns else parts), {}
+
+
+_by_field(column, "array[at + {row}, lane]", True)
+_by_field(set_column, "array[at + {row}, lane] = values.{name}", False)
+_by_field(labelled, "record.{name}", True)
+_by_field(set_labelled, "record.{name} = values.{name}", False)
 
 
 @intrinsic(prefer_literal=True)

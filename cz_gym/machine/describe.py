@@ -19,7 +19,7 @@ from .puller import DEFAULT, PullerFile, doubts, find_puller, value_of
 
 def implied(puller: PullerFile) -> dict[str, str]:
     """What follows from a puller's numbers at its operating point, as texts by headings."""
-    q, p, pull = puller.parameters, make_puller(puller.parameters), puller.pull_room
+    q, p, pull, power = puller.parameters, make_puller(puller.parameters), puller.pull_room, puller.power_range
     model, chain = radius_model(p), [STATES.index(name) for name in ("T_1", "T_2", "T_b")]
     lags = sorted(-1.0 / np.linalg.eigvals(linearise(p).A[np.ix_(chain, chain)]).real / MINUTE)
     fastest = 2.0 * q.v_0 if math.isinf(pull) else q.v_0 + min(pull, q.v_0)
@@ -36,7 +36,7 @@ def implied(puller: PullerFile) -> dict[str, str]:
         "hot zone": f"time constants {', '.join(f'{lag:.3g}' for lag in lags)} min",
         "pull speed": f"{(2.0 * q.v_0 - fastest) / MM_PER_MIN:.4g} to {fastest / MM_PER_MIN:.4g} mm/min"
         + _stated(puller, "pull_slew"),
-        "heater": f"{(p.Q_H_0 - puller.power_range) / KILO:.4g} to {(p.Q_H_0 + puller.power_range) / KILO:.4g} kW"
+        "heater": f"{max(p.Q_H_0 - power, 0.0) / KILO:.4g} to {(p.Q_H_0 + power) / KILO:.4g} kW"
         + _stated(puller, "heater_slew", "heater_step", "heater_lag", "heater_dead_time"),
         "sensors": f"every {puller.control_interval:g} s"
         + _stated(puller, "camera_noise", "pyrometer_noise", "latency", "pyrometer_filter"),
@@ -73,7 +73,3 @@ def _main(given: argparse.Namespace) -> None:
         print(f"{heading:<15} {text or 'nothing'}")
     for doubt in doubts(puller):
         print(doubt, file=sys.stderr)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -100,10 +100,8 @@ class PullerFile:
                 f"the heater would have to be at {plant.T_1_0:.0f} K, and none stands more than {HOTTEST:.0f} K: "
                 f"check T_m_K = {self.parameters.T_m:g}, T_e_K, G_2b_W_per_K and kappa_12_W_per_K4"
             )
-        if (step := self.heater_step or 0.0) >= self.power_range:
-            raise CzError(
-                f"heater_step_W = {step:g} is no less than the heater's range, {self.power_range / KILO:g} kW"
-            )
+        if (step := self.heater_step or 0.0) >= (power := self.power_range):
+            raise CzError(f"heater_step_W = {step:g} is no less than the heater's range, {power / KILO:g} kW")
 
     @cached_property
     def hash(self) -> str:
@@ -140,7 +138,7 @@ class PullerFile:
 
     @property
     def scale(self) -> float:
-        """Its radius r_0 in units of the default puller's [-]."""
+        """Ratio of the puller's radius r_0 to the default puller's [-]."""
         return self.parameters.r_0 / DEFAULT.parameters.r_0
 
     @property
@@ -183,9 +181,8 @@ def find_puller(given: str | Path | PullerFile | None) -> PullerFile:
     if given is None or isinstance(given, PullerFile):
         return given or DEFAULT
     if not isinstance(given, str | Path):
-        raise CzError(
-            f"puller must be a puller file, a shipped name or a cz_gym.machine.puller.PullerFile, not {given!r:.80}"
-        )
+        kinds = "a puller file, a shipped name or a cz_gym.machine.puller.PullerFile"
+        raise CzError(f"puller must be {kinds}, not {given!r:.80}")
     if isinstance(given, str) and "\n" in given:
         return from_toml(given)
     shipped, file = {each.stem: each for each in sorted(FOLDER.glob("*.toml"))}, Path(given)
@@ -231,9 +228,8 @@ def doubts(puller: PullerFile) -> list[str]:
     if (step := puller.heater_step or 0.0) > 0.05 * power:
         lines.append(f"heater_step_W = {step:g} is a coarse step for a heater's range of {power / KILO:g} kW")
     if power > nominal:
-        lines.append(
-            f"the heater's range of {power / KILO:g} kW is more than the nominal power, {nominal / KILO:.4g} kW"
-        )
+        reach, most = power / KILO, nominal / KILO
+        lines.append(f"the heater's range of {reach:g} kW is more than the nominal power, {most:.4g} kW")
     return lines
 
 

@@ -65,7 +65,8 @@ def locked(folder: Path, patience: float = 0.0) -> Iterator[None]:
     """
     from filelock import FileLock, Timeout
 
-    lock, made = FileLock(folder / LOCK, timeout=patience), _missing(folder)
+    lock = FileLock(folder / LOCK, timeout=patience)
+    new = [each for each in (folder, *folder.parents) if not each.exists()]
     with naming(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try:
@@ -79,13 +80,8 @@ def locked(folder: Path, patience: float = 0.0) -> Iterator[None]:
             (folder / LOCK).unlink(missing_ok=True)
         lock.release()
         with suppress(OSError):  # not empty
-            for each in made:
+            for each in new:
                 each.rmdir()
-
-
-def _missing(folder: Path) -> list[Path]:
-    """A folder and its parents as far as they do not exist, innermost first."""
-    return [each for each in (folder, *folder.parents) if not each.exists()]
 
 
 def check_writable(path: Path) -> None:

@@ -14,6 +14,16 @@ def map_arrays(function: Callable[..., Any], *values: Any) -> Any:
     return type(values[0])(*parts) if hasattr(values[0], "_fields") else tuple(parts)
 
 
+def leaves(value: Any, between: str = "_", name: str = "") -> dict[str, Any]:
+    """The arrays of nested tuples, in order, by the names of their fields, or places, with ``between`` them."""
+    if not isinstance(value, tuple):
+        return {name: value}
+    parts: dict[str, Any] = {}
+    for field, part in zip(getattr(value, "_fields", range(len(value))), value, strict=True):
+        parts |= leaves(part, between, f"{name}{between}{field}" if name else str(field))
+    return parts
+
+
 def select(where: Any, one: Any, other: Any) -> Any:
     """``one`` in the slots where ``where``, of shape (n,), is true, ``other`` elsewhere; nested tuples of arrays."""
     return map_arrays(lambda a, b: np.where(np.reshape(where, (-1, *(1,) * (np.ndim(b) - 1))), a, b), one, other)

@@ -5,12 +5,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from sphinx.pycode import ModuleAnalyzer
+
 from cz_gym import Parameters, Puller, State
 from cz_gym.body.plant import Disturbance, Inputs
 from cz_gym.body.signals import INFO_ROWS
 from cz_gym.physics.parameters import describe
-
-from .attributes import attributes
 
 PHYSICS = Path(__file__).parents[1] / "physics.md"
 GREEK = frozenset({"alpha", "kappa", "lam", "lambda", "phi", "rho", "sigma", "theta", "Phi"})
@@ -28,6 +28,7 @@ UNLIKE = {
     "cos_alpha_0": r"\cos\alpha_0",
 }
 """Symbols that do not follow from their names."""
+UNIT = re.compile(r"\s*\[([^\]\[]*)\]")
 FORMULA = re.compile(r"\$\$((?:(?!\$\$).)*)\\tag\{(\d+)\}\s*\$\$", re.DOTALL)
 WITHOUT_SYMBOL = frozenset({"action_clipped", "cost", "r_br_measured"})
 
@@ -72,8 +73,13 @@ def equations(tex: str) -> tuple[str, ...]:
 
 
 def _documented(cls: type, without: tuple[str, ...] = ()) -> list[Row]:
-    """The fields of a class with what it says of them."""
-    return [_row(*field) for field in attributes(cls) if field.name not in without]
+    """The fields of a class with the text below each, whose first brackets hold the unit."""
+    rows = []
+    for (owner, name), lines in ModuleAnalyzer.for_module(cls.__module__).find_attr_docs().items():
+        if owner == cls.__name__ and name not in without:
+            text, unit = " ".join(lines).strip(), UNIT.search(" ".join(lines))
+            rows.append(_row(name, unit[1] if unit else "", UNIT.sub("", text, count=1).rstrip(".")))
+    return rows
 
 
 def _row(name: str, unit: str, meaning: str, value: str = "", source: str = "") -> Row:
@@ -83,11 +89,8 @@ def _row(name: str, unit: str, meaning: str, value: str = "", source: str = "") 
 def seen() -> list[Row]:
     """Rows of ``info`` that have a symbol and are neither states nor inputs."""
     known = {*State._fields, *Inputs._fields, *WITHOUT_SYMBOL}
-    return [
-        _row(row.name, row.unit, row.meaning)
-        for row in INFO_ROWS
-        if row.name not in known and not row.name.startswith("term_")
-    ]
+    shown = (row for row in INFO_ROWS if row.name not in known and not row.name.startswith("term_"))
+    return [_row(row.name, row.unit, row.meaning) for row in shown]
 
 
 def parameters() -> list[Row]:

@@ -52,33 +52,24 @@ def units(text: str) -> str:
 def channels(listed: Iterable[Channel]) -> list[str]:
     """A table of observation channels."""
     scales = {"v_p": "$v_0$", "v_p_mean": "$v_0 / 20$"}
-    rows = (
-        (str(i), code(c.name), units(c.unit), scales.get(c.name, f"{c.scale:g}"), c.meaning)
-        for i, c in enumerate(listed)
-    )
+    rows = []
+    for i, c in enumerate(listed):
+        rows.append((str(i), code(c.name), units(c.unit), scales.get(c.name, f"{c.scale:g}"), c.meaning))
     return markdown(("index", "name", "unit", "scale", "meaning"), rows)
 
 
 def remembered() -> list[str]:
     """The channels of "history": the present ones, then where the spans of the past stand."""
     at = {channel.name: i for i, channel in enumerate(HISTORY)}
-    spans = [HISTORY[at[f"{name}_{LAGS[0]:g}s"]] for name in LAGGED]
-    scales = [
-        f"{c.scale / PULL_SCALE:g} $v_0$" if name == "v_p" else f"{c.scale:g} {units(c.unit)}"
-        for name, c in zip(LAGGED, spans, strict=True)
-    ]
-    heads = [f"{code(name)} [{scale}]" for name, scale in zip(LAGGED, scales, strict=True)]
-    rows = (
-        (f"{before:g} to {age:g} s", *(str(at[f"{name}_{age:g}s"]) for name in LAGGED))
-        for before, age in pairwise((0.0, *LAGS))
-    )
+    heads, rows = ["ages of the samples"], []
+    for name in LAGGED:
+        c = HISTORY[at[f"{name}_{LAGS[0]:g}s"]]
+        scale = f"{c.scale / PULL_SCALE:g} $v_0$" if name == "v_p" else f"{c.scale:g} {units(c.unit)}"
+        heads.append(f"{code(name)} [{scale}]")
+    for before, age in pairwise((0.0, *LAGS)):
+        rows.append((f"{before:g} to {age:g} s", *(str(at[f"{name}_{age:g}s"]) for name in LAGGED)))
     present = channels(HISTORY[: at["integral"] + 1])
-    return [
-        *present,
-        "Index and scale of each span's difference:",
-        "",
-        *markdown(("ages of the samples", *heads), rows),
-    ]
+    return [*present, "Index and scale of each span's difference:", "", *markdown(heads, rows)]
 
 
 def info() -> list[str]:
@@ -111,8 +102,8 @@ def scenario_table(columns: list[Scenario]) -> list[str]:
 
 def single_scenarios() -> list[str]:
     """The scenarios with one of randomized's families, and which it is."""
-    found = {name: _single(scenario) for name, scenario in SCENARIOS.items()}
-    return markdown(("scenario", "family"), [(code(name), code(family)) for name, family in found.items() if family])
+    pairs = ((name, _single(scenario)) for name, scenario in SCENARIOS.items())
+    return markdown(("scenario", "family"), [(code(name), code(family)) for name, family in pairs if family])
 
 
 def _single(scenario: Scenario) -> str | None:
@@ -154,27 +145,21 @@ def puller() -> list[str]:
 
 def camera() -> list[str]:
     """The camera's parameters."""
-    default = Camera()
-    rows = (
-        (code(name), f"{getattr(default, name):.6g}", units(q.unit), q.meaning, q.source)
-        for name, q in describe(Camera).items()
-    )
+    rows = []
+    for name, q in describe(Camera).items():
+        rows.append((code(name), f"{getattr(Camera(), name):.6g}", units(q.unit), q.meaning, q.source))
     return markdown(("code", "value", "unit", "meaning", "source"), rows)
 
 
 def exported() -> list[str]:
     """What the study of exported C found: each controller's largest difference of an action, and rows that differ."""
-    found: dict[tuple[str, str], list[Any]] = {}
+    by_name: dict[tuple[str, str], list[Any]] = {}
     for row in json.loads((DOCS.parent / "results" / "export" / "export.json").read_text())["rows"]:
-        found.setdefault((code(row["controller"]), row["real"]), []).append(row)
-    rows = (
-        (
-            *names,
-            f"{max(row['difference'] for row in of):.1e}",
-            f"{sum(r['python'] != r['c'] for r in of)} of {len(of)}",
-        )
-        for names, of in found.items()
-    )
+        by_name.setdefault((code(row["controller"]), row["real"]), []).append(row)
+    rows = []
+    for names, of in by_name.items():
+        differ = f"{sum(row['python'] != row['c'] for row in of)} of {len(of)}"
+        rows.append((*names, f"{max(row['difference'] for row in of):.1e}", differ))
     return markdown(("controller", "C", "largest difference of an action", "rows of the table that differ"), rows)
 
 

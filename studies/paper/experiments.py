@@ -103,9 +103,8 @@ def trace(
     config = make_config(scenario, model, "measured", interval, horizon, meniscus=meniscus, action="direct")
     run = rollout(policy.for_config(config) if hasattr(policy, "for_config") else policy, config, [0])
     lived = int(run.alive.sum())
-    logged = Logged(
-        *(np.concatenate([start[0], log[:lived, 0]]) for start, log in zip(run.start, run.signals, strict=True))
-    )
+    pairs = zip(run.start, run.signals, strict=True)
+    logged = Logged(*(np.concatenate([start[0], log[:lived, 0]]) for start, log in pairs))
     puller = make_puller(lam=MODELS[model], meniscus=meniscus)
     r_tilde = logged.r_br_measured - puller.ring_bias
     parallel = getattr(policy, "compensator", None)

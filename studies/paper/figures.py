@@ -156,10 +156,9 @@ FIGURES: dict[str, tuple[str, Callable[[], Figure]]] = {
     "figure_09_bode.png": ("Figure 9: compensated loops.", frequency_responses),
     "figure_11_cases.png": ("Figure 11: cases A and B.", case_comparison),
     "figure_12_temperatures.png": (
-        "Figure 12: temperatures, Model I; those of Model II differ by less than 0.1 K.",
-        ramp_temperatures,
+        "Figure 12: temperatures, Model I; those of Model II differ by less than 0.1 K.", ramp_temperatures,
     ),
     "figure_13_ramp_I.png": ("Figure 13: the ramp, Model I.", partial(ramp_response, "I")),
     "figure_14_ramp_II.png": ("Figure 14: the ramp, Model II.", partial(ramp_response, "II")),
-}
+}  # fmt: skip
 """Captions and functions of the figures by file name, numbered as in the paper."""

@@ -3,7 +3,7 @@
 from cz_gym import HURLE, Parameters
 from cz_gym.body.process import BODY
 from cz_gym.config import make_config
-from cz_gym.jit.code_hash import hash_files
+from cz_gym.jit.cache import hash_files
 from cz_gym.jit.compile import jittable
 
 

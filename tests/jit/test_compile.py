@@ -28,11 +28,8 @@ print(cache_folder(), a, sum(series._factors.stats.cache_hits.values()), sep="|"
 @pytest.fixture
 def package(tmp_path):
     """A folder that holds a copy of the package."""
-    shutil.copytree(
-        ROOT / "cz_gym",
-        tmp_path / "copy" / "cz_gym",
-        ignore=shutil.ignore_patterns("__pycache__", "agents", "baselines"),
-    )
+    left_out = shutil.ignore_patterns("__pycache__", "agents", "baselines")
+    shutil.copytree(ROOT / "cz_gym", tmp_path / "copy" / "cz_gym", ignore=left_out)
     return tmp_path / "copy"
 
 
@@ -152,10 +149,8 @@ def test_a_users_meniscus_is_never_run_from_a_cache():
     def height(r_c, theta, a):
         return 1.1 * hurle_height(r_c, theta, a)
 
-    kept = [
-        isinstance(build_kernels(BODY, one).step._cache, CachedCode) for one in (HURLE, HURLE._replace(height=height))
-    ]
-    assert kept == [True, False]
+    for meniscus, kept in ((HURLE, True), (HURLE._replace(height=height), False)):
+        assert isinstance(build_kernels(BODY, meniscus).step._cache, CachedCode) is kept
 
 
 TWO_MENISCI = """

@@ -158,6 +158,7 @@ def test_the_command_prints_what_a_file_implies(tmp_path, capsys):
                  "0 to 2.4 mm/min", "heater lag 2 to 5 s", "sigma_N_per_m = 0.72", "latency_s"):  # fmt: skip
         assert text in printed.out
     assert "is one of them a diameter" in printed.err
+    assert describe.implied(PullerFile(heater_range=60.0 * KILO))["heater"].startswith("0 to 117.")
 
 
 @pytest.mark.parametrize("name", SHIPPED)

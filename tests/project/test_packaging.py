@@ -165,7 +165,7 @@ USES = {
     "mpc": "from cz_gym.baselines import mpc, registry as r; import cz_gym.config as c; r.find_controller('ekf-mpc')",
     "data": "run('data --policies paper --scenarios nominal --episodes 1 --out', out)",
     "cluster": "import cz_gym.evaluation.cluster as c, distributed; distributed.Client; c.versions()",
-    "plant": "import cz_gym.machine.serve.__main__; run('export --plant --to fmu --out', out)",
+    "plant": "import cz_gym.machine.serve.command; run('export --plant --to fmu --out', out)",
 }
 """What a user of each extra does with it."""
 

@@ -112,11 +112,8 @@ class Watch:
         p, old, new = self._slots["puller"], self._old["x"], self._slots["x"]
         middle = (self._slots["k"] - 0.5) * self._dt
         melt = melt_left(middle, self._slots["episode"].view(np.recarray))
-        stored = (
-            p["C_1"] * (new["T_1"] - old["T_1"])
-            + p["C_2"] * (new["T_2"] - old["T_2"])
-            + p["C_b"] * melt * (new["T_b"] - old["T_b"])
-        )
+        capacities = {"T_1": p["C_1"], "T_2": p["C_2"], "T_b": p["C_b"] * melt}
+        stored = sum(capacity * (new[name] - old[name]) for name, capacity in capacities.items())
         flows = 0.5 * (_losses(p, old) + _losses(p, new))
         behind = self._slots["episode"]["heater_lag"] * (self._slots["Q_heats"] - self._old["Q_heats"])
         gained = self._dt * (infos["Q_H"] - flows + self._slots["Q_d"]) - behind
@@ -128,10 +125,8 @@ class Watch:
 
 def _losses(p, x):
     """Heat that insulation and melt surface lose [W]."""
-    surface = (
-        p["emission"] * np.pi * (p["R_cr"] ** 2 - x["r_c"] ** 2) * (fourth_power(x["T_b"]) - fourth_power(p["T_e"]))
-    )
-    return p["G_1a"] * (x["T_1"] - p["T_a"]) + surface
+    surface, radiated = np.pi * (p["R_cr"] ** 2 - x["r_c"] ** 2), fourth_power(x["T_b"]) - fourth_power(p["T_e"])
+    return p["G_1a"] * (x["T_1"] - p["T_a"]) + p["emission"] * surface * radiated
 
 
 def _into_crystal(p, old, new, infos, dt):

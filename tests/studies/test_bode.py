@@ -12,15 +12,11 @@ from studies import bode
 OWN = """
 import numpy as np
 class Forgetful:
+    gains = [0.0, 0.0]
     def predict(self, observation, state=None, episode_start=None, deterministic=True):
-        return np.zeros((len(np.atleast_2d(observation)), 2)), state
-"""
-
-GAIN = """
-import numpy as np
-class Gain:
-    def predict(self, observation, state=None, episode_start=None, deterministic=True):
-        return np.outer(np.atleast_2d(observation)[:, 0], [0.02, 0.0]), state
+        return np.outer(np.atleast_2d(observation)[:, 0], self.gains), state
+class Gain(Forgetful):
+    gains = [0.02, 0.0]
 """
 
 
@@ -43,7 +39,7 @@ def test_phases_are_read_against_minus_180_degrees():
 
 
 def test_a_gain_alone_in_a_file_of_one_s_own_needs_neither_memory_nor_interval(tmp_path):
-    (tmp_path / "my.py").write_text(GAIN)
+    (tmp_path / "my.py").write_text(OWN)
     form = bode.form_of(f"{tmp_path / 'my.py'}:Gain")
     assert (form.dt, form.controller.A.shape) == (5.0, (0, 0))
     assert form.controller.D[0, 0] == pytest.approx(0.02 * PULL_SCALE / MM)

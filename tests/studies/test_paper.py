@@ -12,14 +12,13 @@ from cz_gym.baselines import CompensatedPID
 from cz_gym.baselines.pid.compensated_pid import SeriesPID
 from cz_gym.body.linearisation import radius_model
 from studies.paper import __main__ as paper
-from studies.paper import comparison
 from studies.paper.experiments import BARE, errors, inverse_response, pull_change, ramp, ramp_numbers, trace
 from studies.paper.figures import FIGURES
 
 
 @pytest.fixture(scope="module")
 def numbers():
-    return json.loads(json.dumps(comparison.numbers(), allow_nan=False))
+    return json.loads(json.dumps(paper.numbers(), allow_nan=False))
 
 
 def test_the_committed_numbers_come_out(numbers):

@@ -142,18 +142,8 @@ def test_only_what_is_meant_for_the_user_is_one_line_and_a_bug_keeps_its_traceba
 
 def test_every_package_of_the_extras_is_known_as_optional():
     project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
-    building = {
-        "beautifulsoup4",
-        "ruff",
-        "mypy",
-        "build",
-        "setuptools",
-        "pytest",
-        "pytest_xdist",
-        "hypothesis",
-        "sybil",
-        "scipy_stubs",
-    }
+    building = {"beautifulsoup4", "ruff", "mypy", "build", "setuptools", "pytest", "pytest_xdist", "hypothesis"}
+    building |= {"sybil", "scipy_stubs"}
     documenting = {"sphinx", "myst_parser", "furo", "latex2mathml", "jupytext"}
     optional = project["optional-dependencies"]
     needed = {re.split(r"[^\w-]", line)[0].replace("-", "_") for extra in optional.values() for line in extra}

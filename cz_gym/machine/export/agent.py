@@ -1,7 +1,5 @@
 """A trained agent as a controller of the shell: its ONNX graph in NumPy, its observation, what its actions mean."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from types import FunctionType, SimpleNamespace
 from typing import Any, NamedTuple
@@ -159,9 +157,8 @@ class Agent:
         sums, n = np.moveaxis(past.sums, 0, -1).copy(), len(measured)
         out = np.concatenate([measured.T, np.zeros((len(HISTORY) - len(MEASURED), n))])
         share = 1.0 / (self.before - self.newest)
-        constants = SimpleNamespace(
-            newest=self.newest, before=self.before, share=share, measured=1.0 / scales(MEASURED, *self.ranges)
-        )
+        sizes = 1.0 / scales(MEASURED, *self.ranges)
+        constants = SimpleNamespace(newest=self.newest, before=self.before, share=share, measured=sizes)
         _uncompiled(remember, sums)(slot, sums, self.dt, out, BODY)
         _uncompiled(recall, sums)(slot, seen, sums, constants, out, BODY)
         table = np.concatenate([sums[1:] - sums[0], np.zeros((1, len(LAGGED), n))])

@@ -1,7 +1,5 @@
 """A block's C as a library of this machine: compiled with the system's compiler, called through ctypes."""
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 import subprocess
@@ -32,9 +30,8 @@ def memory_of(program: Program, single: bool = False) -> tuple[np.dtype[Any], in
     arrays = [(name, kinds[kind], size) for name, (size, kind) in work.items() if size > 1]
     room: Any = ("work", np.dtype([("unused", "u1"), *arrays], align=True))
     cells: Any = [(cell.name, "f8" if cell.wide else real, cell.start.shape) for cell in program.memory]
-    return np.dtype([*((port.name, "f8") for port in program.settings), *cells, room], align=True), 2048 + 16 * len(
-        work
-    )
+    settings = [(port.name, "f8") for port in program.settings]
+    return np.dtype([*settings, *cells, room], align=True), 2048 + 16 * len(work)
 
 
 class CompiledBlock:

@@ -29,14 +29,16 @@ def make_block(name: str, config: Config) -> Block:
     agents: Any = pkgutil.resolve_name(AGENTS)
     known = [entry.name for entry in pkgutil.resolve_name(f"{REGISTRY}:CONTROLLERS") if not entry.bound]
     plant = f"Puller {config.puller.label}; plant {config.plant_hash}; control interval {config.control_interval:g} s."
+    if name not in (*known, FALLBACK, *agents.shipped_names()) and Path(name).suffix != ".onnx":
+        raise CzError(unknown("controller or agent", name, [*known, FALLBACK, *agents.shipped_names()]))
     pid, *margins = pkgutil.resolve_name(SEARCH)(config)
-    found = (
+    fallback = (
         f"Fallback: PID searched for this puller with the drives and the camera of scenario {config.scenario.name}: "
         "gain margin {:.3g}, phase margin {:.3g} deg on Models I and II with a latency of {:g} s.".format(*margins)
     )
     identifier = identifier_of(Path(name.removesuffix(".onnx")).name)
     if name == FALLBACK:
-        return Block(identifier, pid, pid, config, (found, plant))
+        return Block(identifier, pid, pid, config, (fallback, plant))
     if name in known:
         entry = pkgutil.resolve_name(f"{REGISTRY}:find_controller")(name)
         tuned = f"Settings of scenario {config.scenario.name} ({config.scenario.hash})"
@@ -45,11 +47,8 @@ def make_block(name: str, config: Config) -> Block:
         controller = entry.make(config)
         if not (hasattr(controller, "at_rest") and hasattr(controller, "step")):
             raise CzError(f"{name} cannot be exported: it solves an optimisation problem, or has no feedback")
-        return Block(
-            identifier, controller, pid, config, (f"Controller {name}: {entry.meaning}.", f"{tuned}.", plant, found)
-        )
-    if name not in agents.shipped_names() and Path(name).suffix != ".onnx":
-        raise CzError(unknown("controller or agent", name, [*known, FALLBACK, *agents.shipped_names()]))
+        facts = f"Controller {name}: {entry.meaning}.", f"{tuned}.", plant, fallback
+        return Block(identifier, controller, pid, config, facts)
     contract = (policy := agents.load(name)).contract
     its, own = (
         f"puller {each.puller}, plant {each.plant}, control interval {each.control_interval:g} s"
@@ -57,14 +56,10 @@ def make_block(name: str, config: Config) -> Block:
     )
     if its != own:
         raise CzError(f"{name} was trained for {its}, not for {own}")
-    facts = (
-        f"Agent {name}: {contract.algorithm}, seed {contract.training_seed}, trained on {contract.scenario} "
-        f"({contract.scenario_hash}).",
-        f"File {contract.sha256}; observation {contract.observation} {contract.observation_hash}.",
-        plant,
-        found,
-    )
-    return Block(identifier, Agent(policy, config), pid, config, facts)
+    trained = f"trained on {contract.scenario} ({contract.scenario_hash})"
+    about = f"Agent {name}: {contract.algorithm}, seed {contract.training_seed}, {trained}."
+    file = f"File {contract.sha256}; observation {contract.observation} {contract.observation_hash}."
+    return Block(identifier, Agent(policy, config), pid, config, (about, file, plant, fallback))
 
 
 def identifier_of(name: str) -> str:

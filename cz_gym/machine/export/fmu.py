@@ -20,7 +20,7 @@ from cz_gym.machine.puller import PullerFile, write_puller
 from cz_gym.observation import Measured, decode
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
 
-from .ports import INPUTS, OUTPUTS, in_plant_units, in_shares, nominal_puller
+from .ports import INPUTS, OUTPUTS, SETPOINTS, in_plant_units, in_shares, nominal_puller
 from .program import Port
 
 SCRIPT = """import ctypes
@@ -37,8 +37,6 @@ class CzPuller(fmu.CzPuller):
 SHOWN = tuple(port for port in INPUTS if port.name not in ("time_s", "ring_time_s", "automatic"))
 """Readings of the puller's sensors, references and applied drives."""
 TRUTH = Port("crystal_radius_mm", "true radius of the crystal; no sensor shows it, so no controller may read it")
-SETPOINTS = dict(zip((port.name for port in OUTPUTS), ("pull_speed_mm_per_min", "heater_power_kW"), strict=False))
-"""Inputs of the unit, and the applied drives that they begin at."""
 UNITS: dict[str, tuple[str, dict[str, Any]]] = {
     "_mm": ("mm", {"m": 1, "factor": MM}),
     "_mm_per_min": ("mm/min", {"m": 1, "s": -1, "factor": MM_PER_MIN}),
@@ -89,14 +87,13 @@ class CzPuller(Fmi2Slave):  # type: ignore[misc]
         """Return the model description with what pythonfmu leaves out: units, and the unknowns of the initial state."""
         root: Element = super().to_xml(model_options or {})
         units = Element("UnitDefinitions")
-        for name, base in UNITS.values():
-            SubElement(SubElement(units, "Unit", name=name), "BaseUnit", {each: str(n) for each, n in base.items()})
+        for unit, base in UNITS.values():
+            SubElement(SubElement(units, "Unit", name=unit), "BaseUnit", {each: str(n) for each, n in base.items()})
         root.insert(1, units)
         for variable in root.iter("ScalarVariable"):
+            name = variable.attrib["name"]
             for real in variable.iter("Real"):
-                real.set(
-                    "unit", next(unit for end, (unit, _) in UNITS.items() if variable.attrib["name"].endswith(end))
-                )
+                real.set("unit", next(unit for end, (unit, _) in UNITS.items() if name.endswith(end)))
         for outputs in root.findall("ModelStructure/Outputs"):
             SubElement(root[-1], "InitialUnknowns").extend(outputs)
         return root

@@ -4,8 +4,6 @@ Inputs and settings have their names and shape [1]; settings have defaults. ``me
 before the first sample; ``next_memory`` is given to the next call.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -116,19 +114,13 @@ def write_onnx(program: Program, single: bool = False) -> dict[str, bytes]:
     flags = [helper.make_tensor_value_info(name, 9, []) for name in ("go", "again")]
     own = [helper.make_tensor_value_info("sample", 7, []), flags[0], numbers("before", start.size)]
     carried = [flags[1], numbers("after", start.size), *(numbers(f"now_{name}") for name in shown)]
-    body = helper.make_graph(
-        writer.nodes,
-        "sample",
-        [*own, *(numbers(f"last_{name}") for name in shown)],
-        carried,
-        [*writer.constants.values()],
-    )
+    own += [numbers(f"last_{name}") for name in shown]
+    body = helper.make_graph(writer.nodes, "sample", own, carried, [*writer.constants.values()])
     defaults |= {"samples": np.array(PASSES, np.int64), "first": np.array(True), "none": np.zeros(1)}
     constants = [numpy_helper.from_array(value, name) for name, value in defaults.items()]
     results = [numbers("next_memory", start.size), *(numbers(name) for name in shown)]
-    loop = helper.make_node(
-        "Loop", ["samples", "first", "memory", *["none"] * len(shown)], [each.name for each in results], body=body
-    )
+    begin = ["samples", "first", "memory", *["none"] * len(shown)]
+    loop = helper.make_node("Loop", begin, [each.name for each in results], body=body)
     graph = helper.make_graph([loop], program.name, given, results, constants, "\n".join(program.notes))
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR)
     checker.check_model(model)

@@ -1,7 +1,5 @@
 """An exported controller in the simulator: a block, in Python or in another language, as a policy."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol

@@ -1,7 +1,5 @@
 """The ports of a block: its inputs, settings, outputs and alarm bits, and its readings in SI units."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import re
@@ -62,8 +60,8 @@ class Alarm(IntFlag):
 
 def meanings(kind: Any) -> dict[Any, str]:
     """The members of an enumeration with the docstrings below them."""
-    found = re.findall(r'^    (\w+) = \d+\n    """(.*?)"""', inspect.getsource(kind), re.MULTILINE | re.DOTALL)
-    return {kind[name]: " ".join(text.split()) for name, text in found}
+    members = re.findall(r'^    (\w+) = \d+\n    """(.*?)"""', inspect.getsource(kind), re.MULTILINE | re.DOTALL)
+    return {kind[name]: " ".join(text.split()) for name, text in members}
 
 
 INPUTS = (
@@ -85,10 +83,7 @@ INPUTS = (
 """The inputs of every block."""
 READINGS = {
     **{name: (f"{name}_mm", "nominal_radius_mm", "r_0", MM) for name in ("r_ref", "r_ref_1min", "r_ref_5min")},
-    **{
-        name: (f"{name}_K", "nominal_T_1_K", "T_1_0", 1.0)
-        for name in ("T_1_ref", "T_1_ref_1min", "T_1_ref_5min", "T_1")
-    },
+    **{f"T_1{end}": (f"T_1{end}_K", "nominal_T_1_K", "T_1_0", 1.0) for end in ("_ref", "_ref_1min", "_ref_5min", "")},
     "v_p": ("pull_speed_mm_per_min", "nominal_pull_speed_mm_per_min", "v_0", MM_PER_MIN),
     "Q_H": ("heater_power_kW", "nominal_heater_power_kW", "Q_H_0", KILO),
 }
@@ -99,6 +94,8 @@ OUTPUTS = (
     Port("alarms", "sum of the alarm bits"),
 )
 """The outputs of every block."""
+SETPOINTS = dict(zip((port.name for port in OUTPUTS), ("pull_speed_mm_per_min", "heater_power_kW"), strict=False))
+"""The setpoints, and the applied drives that follow them."""
 
 
 def nominal_puller(config: Config) -> Puller:
@@ -162,8 +159,5 @@ def in_plant_units(seen: Measured, puller: Any) -> dict[str, Any]:
 def in_shares(setpoints: Mapping[str, Any], config: Config) -> Floats:
     """Setpoints by their names in :data:`OUTPUTS` as shares of the drives' ranges above nominal, shape (..., 2)."""
     puller, (pull, heater, _) = nominal_puller(config), OUTPUTS
-    shares = (
-        setpoints[pull.name] * MM_PER_MIN / puller.v_0 - 1.0,
-        (setpoints[heater.name] * KILO - puller.Q_H_0) / config.heater_range,
-    )
-    return np.stack(shares, axis=-1)
+    power = setpoints[heater.name] * KILO - puller.Q_H_0
+    return np.stack([setpoints[pull.name] * MM_PER_MIN / puller.v_0 - 1.0, power / config.heater_range], axis=-1)

@@ -1,13 +1,13 @@
 """A recorded controller: its inputs, memory and outputs; the description from which every language is written."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from cz_gym.support.nested import leaves, map_arrays
 
 from .trace import BAD, Floats, Graph, Ids, Node
 
@@ -62,27 +62,12 @@ class Program:
     @cached_property
     def nodes(self) -> tuple[Node, ...]:
         """The nodes that outputs or memory depend on, in order; without constants."""
-        results = np.concatenate(
-            [self.due, self.again, *(ids for _, ids in self.outputs), *(cell.after for cell in self.memory)]
-        )
-        wanted = set(self.graph.owners(results).tolist())
+        results = [self.due, self.again, *(ids for _, ids in self.outputs), *(cell.after for cell in self.memory)]
+        wanted = set(self.graph.owners(np.concatenate(results)).tolist())
         for at in reversed(range(len(self.graph.nodes))):
             if at in wanted:
                 wanted.update(*(self.graph.owners(ids).tolist() for ids in self.graph.nodes[at].args))
         return tuple(self.graph.nodes[at] for at in sorted(wanted) if self.graph.nodes[at].op != "constant")
-
-
-def flatten(value: Any, name: str = "") -> list[tuple[str, Any]]:
-    """Names and arrays of nested NamedTuples, in order; names are joined by underscores."""
-    if not isinstance(value, tuple):
-        return [(name, value)]
-    parts: Any = zip(value._fields, value, strict=True)  # type: ignore[attr-defined]
-    return [leaf for part, each in parts for leaf in flatten(each, f"{name}_{part}".strip("_"))]
-
-
-def rebuild(like: Any, leaves: Iterator[Any]) -> Any:
-    """Nested NamedTuples like ``like`` with the arrays of an iterator, in order."""
-    return type(like)(*(rebuild(each, leaves) for each in like)) if isinstance(like, tuple) else next(leaves)
 
 
 def record(
@@ -96,18 +81,19 @@ def record(
 
     ``ports`` are settings, inputs and outputs. The first two are passed as one dictionary of traced numbers, and
     outputs are returned as one.
-    """  # fmt: skip
+    """
     graph, (settings, inputs, outputs) = Graph(), ports
-    leaves = [(leaf, np.clip(np.asarray(value, np.float64), -BAD, BAD)) for leaf, value in flatten(memory)]
-    cells: list[Any] = [graph.input(leaf, value.shape) if value.size else value for leaf, value in leaves]
+    before = {leaf: np.clip(np.asarray(value, np.float64), -BAD, BAD) for leaf, value in leaves(memory).items()}
+    cells: list[Any] = [graph.input(leaf, value.shape) if value.size else value for leaf, value in before.items()]
     given = {port.name: graph.input(port.name) for port in (*settings, *inputs)}
-    results, after, due, again = step(given, rebuild(memory, iter(cells)))
+    rest = iter(cells)
+    results, after, due, again = step(given, map_arrays(lambda _: next(rest), memory))
 
     def ids_of(value: Any) -> Ids:
         return graph.lift(value).ids.ravel()
 
     sources, held = [_sources(graph, node) for node in graph.nodes], list[Cell]()
-    for (leaf, value), cell, (_, new) in zip(leaves, cells, flatten(after), strict=True):
+    for (leaf, value), cell, new in zip(before.items(), cells, leaves(after).values(), strict=True):
         if value.size:
             if leaf.endswith("covariance"):  # else rounding makes it ever less symmetric
                 new = 0.5 * (new + new.swapaxes(-1, -2))

@@ -1,7 +1,5 @@
 """A sample of a block: what the time of a call means, which readings are good, what the drives do."""
 
-from __future__ import annotations
-
 from functools import reduce
 from operator import and_
 from typing import Any, NamedTuple
@@ -134,9 +132,9 @@ class Readings(NamedTuple):
     ring: Any
     """Whether the ring is good."""
     pyrometer: Any
-    """The same of the pyrometer."""
+    """Whether the pyrometer is good."""
     reference: Any
-    """The same of references and previews."""
+    """Whether references and previews are good."""
     shown: Any
     still: Any
 
@@ -172,9 +170,8 @@ def trimmed(read: Measured, off_T_1: Any, off_Q_H: Any) -> Measured:
 
 def sane_of(given: Any) -> Any:
     """Whether the settings are numbers in the right order."""
-    ordered = (given["pull_speed_min_mm_per_min"] <= given["pull_speed_max_mm_per_min"]) & (
-        given["heater_power_min_kW"] <= given["heater_power_max_kW"]
-    )
+    ordered = given["pull_speed_min_mm_per_min"] <= given["pull_speed_max_mm_per_min"]
+    ordered = ordered & (given["heater_power_min_kW"] <= given["heater_power_max_kW"])
     positive = ("pull_slew_mm_per_min2", "heater_slew_kW_per_min", "nominal_pull_speed_mm_per_min", "gap_s")
     numbers = (finite(given[name]) for name in given if name not in _INPUTS)
     return reduce(and_, (given[port] > 0.0 for port in positive), reduce(and_, numbers, ordered))
@@ -208,9 +205,8 @@ class Drive(NamedTuple):
 
     def move(self, old: Any, wanted: Any, share: Any, dt: float) -> tuple[Any, Any]:
         """The setpoint on its way from ``old`` to a value, and whether range or slew rate cut it."""
-        free, bound = (
-            np.where(share < 1.0, old + share * (to - old), to) for to in (wanted, np.clip(wanted, *self.span))
-        )
+        ends = wanted, np.clip(wanted, *self.span)
+        free, bound = (np.where(share < 1.0, old + share * (to - old), to) for to in ends)
         most = self.slew * (dt / MINUTE)
         limit = np.clip(bound, old - most, old + most)
         return limit, np.abs(limit - free) > 1e-6
@@ -220,7 +216,7 @@ _PORTS = (
     ("pull_speed_mm_per_min", "pull_speed_{}_mm_per_min", "nominal_pull_speed_mm_per_min", "pull_slew_mm_per_min2"),
     ("heater_power_kW", "heater_power_{}_kW", "nominal_heater_power_kW", "heater_slew_kW_per_min"),
 )
-"""Of each drive: its reading, the ends of its range, its nominal value and its slew rate."""
+"""Names of each drive's reading, of the ends of its range, its nominal value and its slew rate."""
 
 
 def drive_of(sane: Any, facts: Facts, call: Call, seen: Readings, given: Any, memory: Memory, which: int) -> Drive:

@@ -10,8 +10,6 @@ pull speed alone. After every takeover the setpoints start at the applied drives
 :attr:`Block.program` is its record, from which other languages are written.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -43,8 +41,8 @@ power [share of the heater's range]. The rest counts as an error of the nominal 
 SETTLED = 30.0 * MINUTE
 """Time since a takeover or a bad pyrometer, from which it counts that a model does not explain the readings [s]."""
 SLOWER, FOLLOWED = 1.5, 0.5
-"""Of the heater without a pyrometer: the time constant of the mean pull speed, in multiples of its averaging time; the
-share of the recipe's movement that is followed [-]."""
+"""How the heater moves without a pyrometer: the time constant of the mean pull speed, in multiples of its averaging
+time, and the share of the recipe's movement that is followed [-]."""
 TEMPERATURES = "T_1", "T_2", "T_b"
 UNKNOWN = "clock_s", "called_s", "pull", "heater", "shown"
 """Memory that is infinite before the first sample."""
@@ -58,7 +56,7 @@ class Controller(Protocol):
         """Whether it is given a pyrometer reading that is not finite as such."""
 
     def at_rest(self, seen: Measured) -> Any:
-        """Its memory before the first sample."""
+        """The controller's memory before the first sample."""
 
     def step(self, seen: Measured, memory: Any) -> tuple[Any, Any, Any]:
         """Pull speed [m/s] and heater power [W] above nominal, and the new memory."""
@@ -90,15 +88,12 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
     read = trimmed(seen.read, off_T_1, off_Q_H)
     nominal = drives[0].nominal, drives[1].nominal + off_Q_H / KILO
     between = memory.readings.ring_error + call.share * (read.ring_error - memory.readings.ring_error)
-    read = read._replace(
-        ring_error=np.where(runs & call.again, between, read.ring_error),
-    )
+    read = read._replace(ring_error=np.where(runs & call.again, between, read.ring_error))
     estimates = controller.accepts_missing_temperature
     shown = np.where(call.again, np.inf, seen.T_1 - off_T_1)
     told = read._replace(T_1=shown, valid=np.where(call.again, 0.0, read.valid)) if estimates else read
-    own = controller.step(
-        told, memory.controller if runs.all() else select(runs, memory.controller, controller.at_rest(read))
-    )
+    held = memory.controller if runs.all() else select(runs, memory.controller, controller.at_rest(read))
+    own = controller.step(told, held)
     other = own[0], own[1], memory.pid
     if (fallback | ~(finite(own[0]) & finite(own[1]))).any():
         other = pid.step(read, select(fallen, memory.pid, pid.at_rest(read)))
@@ -133,27 +128,12 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
     alarms = reduce(add, (np.where(holds, float(bit), 0.0) for bit, holds in bits.items()))
     outputs = dict(zip((port.name for port in OUTPUTS), (*setpoints, alarms), strict=True))
     now = Memory(
-        clock_s=call.clock,
-        called_s=given["time_s"],
-        late=np.where(call.late, 1.0, 0.0),
-        engaged=np.where(engaged, 1.0, 0.0),
-        since=since,
-        bad=bad,
-        fallback=np.where(fallback | (engaged & ~sound), 1.0, 0.0),
-        pull=setpoints[0],
-        heater=setpoints[1],
-        astray=astray,
-        shown=seen.shown,
-        still=seen.still,
-        dark=dark,
-        level=level,
-        calm=calm,
-        off_T_1=off_T_1,
-        off_Q_H=off_Q_H,
-        readings=seen.read._replace(ring_error=read.ring_error),
-        controller=own[2],
-        pid=other[2],
-    )
+        clock_s=call.clock, called_s=given["time_s"], late=np.where(call.late, 1.0, 0.0),
+        engaged=np.where(engaged, 1.0, 0.0), since=since, bad=bad,
+        fallback=np.where(fallback | (engaged & ~sound), 1.0, 0.0), pull=setpoints[0], heater=setpoints[1],
+        astray=astray, shown=seen.shown, still=seen.still, dark=dark, level=level, calm=calm, off_T_1=off_T_1,
+        off_Q_H=off_Q_H, readings=seen.read._replace(ring_error=read.ring_error), controller=own[2], pid=other[2],
+    )  # fmt: skip
     return outputs, now, call.due, call.again
 
 
@@ -182,12 +162,8 @@ class Block:
     def start(self, n: int) -> Memory:
         """The memory of n blocks before their first sample."""
         zero = Measured(*(np.zeros(n) for _ in Measured._fields))
-        return Memory(
-            **{name: np.full(n, math.inf if name in UNKNOWN else 0.0) for name in Memory._fields[:-3]},
-            readings=zero,
-            controller=self.controller.at_rest(zero),
-            pid=self.pid.at_rest(zero),
-        )
+        numbers = (np.full(n, math.inf if name in UNKNOWN else 0.0) for name in Memory._fields[:-3])
+        return Memory._make([*numbers, zero, self.controller.at_rest(zero), self.pid.at_rest(zero)])
 
     def run(self, inputs: Mapping[str, Any], memory: Memory) -> tuple[dict[str, Floats], Memory]:
         """The outputs, each of shape (n,), and the next memory, for inputs and settings; missing ones have defaults."""
@@ -217,22 +193,13 @@ class Block:
         pull = T_b * puller.k_l / (puller.v_0 * puller.rho_dH * puller.h_0)
         slow = -1.0 / float(np.linalg.eigvals(A).real.max())
         noise = max(each.sensor.pyrometer_noise[1] for each in config.scenario.scenarios)
-        nominal = puller.v_0 / MM_PER_MIN, puller.Q_H_0 / KILO
-        return Facts(
-            config.control_interval,
-            config.ranges,
-            JUMP + 8.0 * noise,
-            1.0 / T_1,
-            slow / (pull * SLOWER * LEVEL),
-            slow,
-            nominal,
-        )
+        trim, nominal = slow / (pull * SLOWER * LEVEL), (puller.v_0 / MM_PER_MIN, puller.Q_H_0 / KILO)
+        return Facts(config.control_interval, config.ranges, JUMP + 8.0 * noise, 1.0 / T_1, trim, slow, nominal)
 
     def _step(self, given: Any, memory: Any) -> Any:
         return step(self.controller, self.pid, self.facts, given, memory)
 
     @cached_property
     def program(self) -> Program:
-        """What it computes, recorded."""
-        ports = settings_of(self.config), INPUTS, OUTPUTS
-        return record(self._step, self.start(1), ports, self.name, self.notes)
+        """The record of what it computes."""
+        return record(self._step, self.start(1), (settings_of(self.config), INPUTS, OUTPUTS), self.name, self.notes)

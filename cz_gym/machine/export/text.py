@@ -1,7 +1,5 @@
 """A recorded program as the files of a block: C99, or IEC 61131-3 structured text."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping
@@ -32,7 +30,7 @@ def write_st(program: Program, single: bool = False) -> dict[str, str]:
 def fill_template(name: str, parts: Mapping[str, str]) -> str:
     """The text of a template with its parts, whose lines are indented as ``$part`` is."""
     text = (TEMPLATES / name).read_text("utf-8")
-    return re.sub(r"(?m)(^ +)?\$\{?(\w+)\}?", lambda found: indent(parts[found[2]], found[1] or ""), text)
+    return re.sub(r"(?m)(^ +)?\$\{?(\w+)\}?", lambda part: indent(parts[part[2]], part[1] or ""), text)
 
 
 def _parts(program: Program, writer: Writer) -> dict[str, str]:

@@ -87,8 +87,8 @@ class Graph:
         nodes = [self.nodes[at] for at in self.owners(ids.ravel())]
         if any(node.op != "constant" for node in nodes):
             return None
-        found = [node.data[element - node.start] for element, node in zip(ids.ravel(), nodes, strict=True)]
-        return np.array(found).reshape(ids.shape)
+        pairs = zip(ids.ravel(), nodes, strict=True)
+        return np.array([node.data[element - node.start] for element, node in pairs]).reshape(ids.shape)
 
     def input(self, name: str, shape: tuple[int, ...] = (1,)) -> Traced:
         """A new input, or memory from the last sample."""

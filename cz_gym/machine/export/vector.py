@@ -1,7 +1,5 @@
 """A block beside readings that are given: a recorded test vector for a port, and a plant's log for a comparison."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -59,8 +57,8 @@ def beside(block: Block, log: Any) -> tuple[Floats, Floats]:
         memory = memory._replace(pull=np.full(1, drives[0]), heater=np.full(1, drives[1]))
         outputs, memory = block.run(given | {"valid": float(np.isfinite(log.ring[k]))}, memory)
         rows.append([outputs[port.name][0] for port in OUTPUTS])
-    found = np.array(rows)
-    return found[:, :2], found[:, 2].astype(int)
+    outputs_of_rows = np.array(rows)
+    return outputs_of_rows[:, :2], outputs_of_rows[:, 2].astype(int)
 
 
 def shadow(block: Block, log: Any) -> dict[str, str]:
@@ -68,14 +66,10 @@ def shadow(block: Block, log: Any) -> dict[str, str]:
     setpoints, alarms = beside(block, log)
     drives = np.stack([log.v_p / MM_PER_MIN, log.Q_H / KILO], axis=-1)
     held = np.vstack([drives[1:], drives[-1:]])  # a row's setpoint is what the next row shows as applied
-    apart, names = setpoints - held, [port.name for port in OUTPUTS[:2]]
-    rows = [
-        (
-            name,
-            *(f"{value:.4g}" for value in (each.mean(), np.sqrt(np.mean(each**2)), *np.quantile(each, [0.05, 0.95]))),
-        )
-        for name, each in zip(names, apart.T, strict=True)
-    ]
+    names, rows = [port.name for port in OUTPUTS[:2]], []
+    for name, each in zip(names, (setpoints - held).T, strict=True):
+        figures = each.mean(), np.sqrt(np.mean(each**2)), *np.quantile(each, [0.05, 0.95])
+        rows.append((name, *(f"{value:.4g}" for value in figures)))
     said = [
         (bit.name, f"{100.0 * np.mean(alarms & bit > 0):.3g}", text)
         for bit, text in meanings(Alarm).items() if np.any(alarms & bit)

@@ -4,8 +4,6 @@ A :class:`Writer` orders the statements and gives their results to a small pool 
 how a language writes them. An operation whose result is used once, element by element, becomes part of an expression.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable
@@ -88,7 +86,7 @@ A loop runs over ``{0}`` from 0 to ``{1}``, which is not included, or ``{2}``, w
 
 
 class Dialect:
-    """One of both languages, in one precision, for the block of a name: a column of :data:`SYNTAX`."""
+    """A column of :data:`SYNTAX`: how C or structured text writes a block's statements in one precision."""
 
     def __init__(self, language: str, block: str, single: bool) -> None:
         self._syntax = {what: texts[language == "st"] for what, texts in SYNTAX.items()}

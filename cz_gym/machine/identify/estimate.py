@@ -71,9 +71,9 @@ class Identified:
 
     start: PullerFile
     estimates: tuple[Estimate, ...]
-    """Of HEATER, LAGS and PULL."""
+    """Estimates of the numbers in HEATER, LAGS and PULL."""
     noise: tuple[Estimate, ...]
-    """Of :class:`Noise`."""
+    """Estimates of the numbers in :class:`Noise`."""
     excitation: tuple[float, float]
     """Moves of pull speed and heater that no reading explains, in multiples of what is needed [-]."""
     errors: Floats
@@ -92,7 +92,7 @@ class Identified:
         return join(self.logs)
 
     def series(self, meniscus: MeniscusModel = HURLE) -> list[tuple[Floats, Floats, Floats]]:
-        """Of each log its times [s], the load on the melt [W] and the fluctuation of the interface [K].
+        """Times [s], load on the melt [W] and fluctuation of the interface [K] of each log.
 
         They are those that a smoother gives for :attr:`puller`, so that its crystal grows as the log's did.
         """
@@ -100,10 +100,8 @@ class Identified:
         model = Model(Noise._fields, self.puller.parameters, meniscus, lags)
         theta = np.array([np.log(each.value / each.prior) for each in self.noise])
         states = [smooth(log, model, theta) for log in self.logs]
-        return [
-            (log.time - log.time[0], each[:, LOAD], each[:, FAST] + each[:, SLOW])
-            for log, each in zip(self.logs, states, strict=True)
-        ]
+        pairs = zip(self.logs, states, strict=True)
+        return [(log.time - log.time[0], each[:, LOAD], each[:, FAST] + each[:, SLOW]) for log, each in pairs]
 
     @property
     def puller(self) -> PullerFile:
@@ -152,30 +150,28 @@ def identify(
     model = Model((*free, *Noise._fields), start.parameters, meniscus, _lags_of(start, heater >= 1.0))
     sd, latency = np.array([sds[name] for name in model.names]), start.latency or 0.0
     rows = [prepare(each, latency) for each in logs]
-    found = _maximise(rows, model, sd)
-    if "heater_lag" in free and (total := _delay(found, model))[0] + 2.0 * total[1] < 0.0:
+    best = _maximise(rows, model, sd)
+    if "heater_lag" in free and (total := _delay(best, model))[0] + 2.0 * total[1] < 0.0:
         logs = tuple(map(shift_drives, logs))
         rows = [prepare(each, latency) for each in logs]
-        found = _maximise(rows, model, sd)
+        best = _maximise(rows, model, sd)
 
     def estimate(name: str) -> Estimate:
         usual = model.value(name, LAM if name == "lam" else 0.0)
         if name not in model.names:
             return Estimate(name, usual, usual, usual, usual, 1.0, excited=False)
         j = model.names.index(name)
-        low, value, high = (model.value(name, found.theta[j] + sign * 1.96 * found.sd[j]) for sign in (-1.0, 0.0, 1.0))
-        delay = name not in LAGS or np.subtract(*(_delay(found, model) * (1.0, 2.0))) > 0.5 * logs[0].interval
-        return Estimate(name, usual, value, low, high, found.sd[j] / sd[j], trusted=bool(delay))
+        low, value, high = (model.value(name, best.theta[j] + sign * 1.96 * best.sd[j]) for sign in (-1.0, 0.0, 1.0))
+        delay = name not in LAGS or np.subtract(*(_delay(best, model) * (1.0, 2.0))) > 0.5 * logs[0].interval
+        return Estimate(name, usual, value, low, high, best.sd[j] / sd[j], trusted=bool(delay))
 
     whole = join(rows)
     read = np.isfinite([whole.T_1, whole.ring]).T
-    errors = np.where(read, found.out.error / np.sqrt(found.out.variance), np.nan)
+    errors = np.where(read, best.out.error / np.sqrt(best.out.variance), np.nan)
     told, noise = tuple(map(estimate, (*HEATER, *LAGS, *PULL))), tuple(map(estimate, Noise._fields))
-    result = Identified(start, told, noise, (pull, heater), errors, found.out, tuple(rows), found.settled)
-    reasons = misfits(
-        result, model.puller(found.theta + 0j), dict(zip(model.names, (found.theta - model.mean) / sd, strict=True))
-    )
-    if reasons:
+    result = Identified(start, told, noise, (pull, heater), errors, best.out, tuple(rows), best.settled)
+    away = dict(zip(model.names, (best.theta - model.mean) / sd, strict=True))
+    if reasons := misfits(result, model.puller(best.theta + 0j), away):
         told, noise = (tuple(e._replace(trusted=False) for e in each) for each in (told, noise))
     return replace(result, estimates=told, noise=noise, misfits=reasons)
 
@@ -202,7 +198,7 @@ class Maximum(NamedTuple):
     theta: Floats
     """Free numbers."""
     covariance: Floats
-    """Theirs."""
+    """Covariance of the free numbers."""
     out: Predicted
     """The filter's output there."""
     settled: bool
@@ -213,12 +209,12 @@ class Maximum(NamedTuple):
         return np.sqrt(np.diag(self.covariance))
 
 
-def _delay(found: Maximum, model: Model) -> Floats:
+def _delay(best: Maximum, model: Model) -> Floats:
     """Sum of the lags and its standard deviation [s], shape (2,)."""
-    lags = model.delays(found.theta)
+    lags = model.delays(best.theta)
     slopes = {"heater_lag": lags.heater_lag, "heater_dead_time": 1.0, "pyrometer_filter": lags.pyrometer_filter}
     slope = np.array([slopes.get(name, 0.0) for name in model.names])
-    return np.array([sum(lags), np.sqrt(slope @ found.covariance @ slope)])
+    return np.array([sum(lags), np.sqrt(slope @ best.covariance @ slope)])
 
 
 def _maximise(logs: Sequence[Log], model: Model, sd: Floats) -> Maximum:
@@ -275,5 +271,5 @@ def _plausible_start(logs: Sequence[Log], model: Model, sd: Floats) -> Floats:
         p = model.puller(model.mean + x * sd)
         return np.array([*(x - away), (p.T_1_0 - T_1) / 5.0, (p.Q_H_0 / Q_H - 1.0) / 0.02])
 
-    found: Floats = least_squares(misfit, away).x
-    return found
+    start: Floats = least_squares(misfit, away).x
+    return start

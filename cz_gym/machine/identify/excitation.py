@@ -59,9 +59,8 @@ class Excited:
         if not (0.0 <= self.pull <= 0.1 and 0.0 <= self.heater <= 0.1):
             raise CzError(f"amplitudes of the excitation lie in 0 to 0.1, not {self.pull!r} and {self.heater!r}")
         if getattr(self.made_for, "puller", "default") != "default" and not hasattr(self.policy, "heater_range"):
-            raise CzError(
-                f"{type(self.policy).__name__} does not say its puller's numbers: excite a controller that does"
-            )
+            name = type(self.policy).__name__
+            raise CzError(f"{name} does not say its puller's numbers: excite a controller that does")
         if not self.clock >= self.interval:
             raise CzError(f"the clock {self.clock!r} s must be at least the control interval of {self.interval:g} s")
 

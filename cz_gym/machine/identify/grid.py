@@ -25,9 +25,9 @@ OUTLIERS = {
     "pull_speed_mm_per_min": (5, 6.0, 0.0, 0.3),
     "heater_power_kW": (5, 6.0, 0.0, 0.3),
 }
-"""Readings count as outliers that lie as many robust deviations from the median of their neighbours (Hampel's filter):
-neighbours, deviations, and the least deviation that counts, in the column's SI unit and as a share of its median. A
-drive's step is none, because half of its neighbours have made it."""
+"""Hampel's filter of each column: number of neighbours, threshold in robust deviations from their median, and the
+least deviation that counts, in the column's SI unit and as a share of its median. A drive's step is no outlier, because
+half of its neighbours have made it."""
 THIN = 11.0
 """Longest time between the rows that are estimated from, where the log's own are closer [s]."""
 ABSURD = 2.0
@@ -38,7 +38,7 @@ class Log(NamedTuple):
     """A log on a regular grid, SI units; each of shape (rows,). Readings that are missing are NaN."""
 
     time: Floats
-    """[s]"""
+    """Times of the rows [s]."""
     ring: Floats
     """Radius of the bright ring as the camera gives it [m]."""
     v_p: Floats

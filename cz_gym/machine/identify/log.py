@@ -66,14 +66,14 @@ def read_log(path: str | Path, columns: Mapping[str, tuple[str, str]] | None = N
             if (column := named[name][0]) not in file:
                 own = next(iter(COLUMNS[name]))
                 raise CzError(f"{unknown('column', column, file)}; {name}=COLUMN:{own} says which one it is")
-        found = {name: (column, unit) for name, (column, unit) in named.items() if column in file}
-        for column, _ in found.values():
+        present = {name: (column, unit) for name, (column, unit) in named.items() if column in file}
+        for column, _ in present.values():
             if isinstance(file[column], pandas.DataFrame):
                 raise CzError(f"two columns are called {column!r}: give one of them another name")
-        notes, unit = dict[str, int](), found["time_s"][1]
+        notes, unit = dict[str, int](), present["time_s"][1]
         seconds, first = times(file[time], unit, line, notes)
         table = pandas.DataFrame(index=seconds.index, columns=list(COLUMNS), dtype=float).assign(time_s=seconds)
-        for name, (column, unit) in list(found.items())[1:]:
+        for name, (column, unit) in list(present.items())[1:]:
             factor, added = COLUMNS[name][unit]
             table[name] = numbers(file[column][seconds.index], line) * factor + added
         infinite = np.isinf(table.to_numpy()).sum()

@@ -41,13 +41,13 @@ class Noise(NamedTuple):
     """Strength of the disturbances and of the sensors' noise."""
 
     camera_sd: Any = 0.025 * MM
-    """[m]"""
+    """Standard deviation of the ring's noise [m]."""
     pyrometer_sd: Any = 0.1
-    """[K]"""
+    """Standard deviation of the pyrometer's noise [K]."""
     fast_sd: Any = 0.25
-    """Fluctuation of the interface temperature with a correlation time of 30 s [K]."""
+    """Fluctuation of the interface temperature with a correlation time of TAU_FAST [K]."""
     slow_sd: Any = 0.25
-    """The one of 780 s [K]."""
+    """Fluctuation of the interface temperature with a correlation time of TAU_SLOW [K]."""
     load_rate: Any = 1e-5
     """Rate of the heat load on the melt, in shares of the heat that passes through it [1/s]."""
 
@@ -74,8 +74,6 @@ OFFSET_SD = 5.0, 1.0 * MM
 DRIFT_SD = 5.0
 """Standard deviation of the hot zone's drift at the first row: heater and susceptor are warmer, and a load on the melt
 takes the heat away [K]."""
-
-
 FLOOR = 0.01, 3e-3 * MM
 """Least noise of pyrometer [K] and ring [m]: no sensor is better."""
 
@@ -170,11 +168,8 @@ class Model(NamedTuple):
         """The lags of free numbers, real or complex, shape (names,)."""
         free = dict(zip(self.names, theta, strict=True))
         lag, dead_time, slow = self.lags
-        return Lags(
-            lag * np.exp(free.get("heater_lag", 0.0)),
-            free.get("heater_dead_time", dead_time),
-            slow * np.exp(free.get("pyrometer_filter", 0.0)),
-        )
+        lag, slow = lag * np.exp(free.get("heater_lag", 0.0)), slow * np.exp(free.get("pyrometer_filter", 0.0))
+        return Lags(lag, free.get("heater_dead_time", dead_time), slow)
 
     def puller(self, theta: Any) -> Any:
         """The puller of free numbers, as :meth:`delays`."""

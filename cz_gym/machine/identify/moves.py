@@ -37,7 +37,7 @@ class Law(NamedTuple):
     """A linear law from what a controller has seen and done to its next move."""
 
     weights: Floats
-    """Of readings, then of the drive's last values and means, then a constant."""
+    """Weights of the readings, then of the drive's last values and means, then a constant."""
     keep: Floats
     """How much of the drive's means is left after a row [-]."""
     slew: float

@@ -1,2 +1,1 @@
-"""A virtual puller: the environment behind an OPC UA server, with an operator's page:
-``cz-gym serve``."""
+"""A virtual puller: the environment behind an OPC UA server, with a page: ``cz-gym serve``."""

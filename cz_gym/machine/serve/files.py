@@ -5,7 +5,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -85,7 +85,7 @@ class State(NamedTuple):
 
     env: EnvState
     memory: npt.NDArray[np.float64]
-    """The fallback's memory, as :func:`flat` gives it."""
+    """Numbers of the fallback's memory, one after the other."""
     attributes: dict[str, Any]
     """Attributes of the machine."""
     tags: dict[str, Any]
@@ -124,16 +124,3 @@ class StateFile:
         with open(new, "wb") as file:
             np.savez(file, facts=np.array(json.dumps(facts)), memory=state.memory, **arrays)
         os.replace(new, self.path)
-
-
-def flat(memory: Any) -> npt.NDArray[np.float64]:
-    """The numbers of nested tuples of arrays, one after the other."""
-    return np.concatenate([flat(each) for each in memory]) if isinstance(memory, tuple) else np.ravel(memory)
-
-
-def unflat(numbers: Iterator[float], like: Any) -> Any:
-    """What :func:`flat` made these numbers of; ``like`` has the same tuples and shapes."""
-    if isinstance(like, tuple):
-        parts = [unflat(numbers, each) for each in like]
-        return type(like)(*parts) if hasattr(like, "_fields") else tuple(parts)
-    return np.array([next(numbers) for _ in range(np.size(like))]).reshape(np.shape(like))

@@ -14,13 +14,14 @@ from cz_gym.config import Config
 from cz_gym.env import CzEnv
 from cz_gym.errors import CzError
 from cz_gym.machine.export.controllers import FALLBACK, make_block
-from cz_gym.machine.export.ports import INPUTS, OUTPUTS, in_plant_units, settings_of
+from cz_gym.machine.export.ports import INPUTS, OUTPUTS, SETPOINTS, in_plant_units, settings_of
 from cz_gym.observation import CLIP, Measured, decode
 from cz_gym.rendering.canvas import Frame
 from cz_gym.rendering.view import record_of
+from cz_gym.support.nested import leaves, map_arrays
 from cz_gym.support.units import HOUR, KILO, MM_PER_MIN
 
-from .files import Log, State, StateFile, flat, unflat
+from .files import Log, State, StateFile
 
 SIZE = (640, 480)
 """Width and height of the picture [px]."""
@@ -53,7 +54,6 @@ class Tag(NamedTuple):
     writable: bool = False
 
 
-SETPOINTS = tuple(port.name for port in OUTPUTS[:2])
 TAGS = (
     Tag("time_s", float, "time since the crystal's start"),
     Tag("state", str, "growing, or how the crystal ended"),
@@ -72,8 +72,6 @@ TAGS = (
 """Every tag, in the order of writing; readings, setpoints and settings are those of the exported blocks."""
 TOLERANCE = 1e-6
 """Rounding in single precision that is forgiven at a setpoint's limits, relative [-]."""
-APPLIED = ("pull_speed_mm_per_min", "heater_power_kW")
-"""Applied values of the drives, in the order of the setpoints."""
 SAVED = ("k", "answered", "manual", "_renewed", "_active", "_pending")
 """Attributes of a machine that its state holds beside the environment's and the fallback's memory."""
 
@@ -119,24 +117,29 @@ class Machine:
     @property
     def spans(self) -> dict[str, tuple[float, float]]:
         """Ranges of readings and drives by their tags: readings outside of theirs count as implausible."""
-        at_rest = Measured(*[0.0] * len(Measured._fields))
-        low, high = (
-            in_plant_units(decode(np.full(len(at_rest), end), *self._ranges), self.puller) for end in (-CLIP, CLIP)
-        )
+        ends = (decode(np.full(len(Measured._fields), end), *self._ranges) for end in (-CLIP, CLIP))
+        low, high = (in_plant_units(end, self.puller) for end in ends)
         limits = {name: tuple(span) for name, span in self.limits.items()}
         spans = {name: (low[name], high[name]) for name in low if name != "valid"}
-        return spans | limits | dict(zip(APPLIED, limits.values(), strict=True))
+        return spans | limits | dict(zip(SETPOINTS.values(), limits.values(), strict=True))
 
     def _resume(self, saved: State) -> None:
         """Go on from a saved state."""
         kinds = {name: type(value) for name, value in saved.tags.items()}
-        sound = kinds == {tag.name: tag.kind for tag in TAGS} and saved.memory.shape == flat(self._memory).shape
+        sound = kinds == {tag.name: tag.kind for tag in TAGS} and saved.memory.shape == self._numbers.shape
         if not sound or set(saved.attributes) != set(SAVED):
             raise CzError("this state was saved by another version of cz_gym, or damaged")
         if saved.tags["alarms"] & Alarm.ENDED:
             raise CzError(f"the crystal of this state has ended ({saved.tags['state']}): name another file")
-        vars(self).update(saved.attributes, _memory=unflat(iter(saved.memory), self._memory))
+        numbers = iter(saved.memory)
+        memory = map_arrays(lambda like: np.array([next(numbers) for _ in like.flat]).reshape(like.shape), self._memory)
+        vars(self).update(saved.attributes, _memory=memory)
         self.hour.append(saved.tags)
+
+    @property
+    def _numbers(self) -> Any:
+        """The numbers of the fallback's memory, one after the other."""
+        return np.concatenate([np.ravel(each) for each in leaves(self._memory).values()])
 
     def offer(self, writes: dict[str, Any]) -> dict[str, str]:
         """Take a client's values, all or none; returns the reasons of those that are refused.
@@ -212,7 +215,7 @@ class Machine:
                 self._log.add(*([before] if self.k == 1 else []), tags)
             if self._state is not None:
                 attributes = {name: getattr(self, name) for name in SAVED}
-                self._state.save(State(self.env.get_state(), flat(self._memory), attributes, tags))
+                self._state.save(State(self.env.get_state(), self._numbers, attributes, tags))
             return tags
 
     def _publish(self, control: str = "held") -> dict[str, Any]:
@@ -223,21 +226,13 @@ class Machine:
             Alarm.CAMERA: seen.valid < 0.5, Alarm.HELD: control == "held", Alarm.FALLBACK: control == "fallback",
             Alarm.MANUAL: control == "manual", Alarm.LATE: self.late, Alarm.ENDED: ending is not None,
         }  # fmt: skip
-        values = (
-            self._fixed
-            | in_plant_units(seen, self.puller)
-            | dict(zip(SETPOINTS, self._active, strict=True))
-            | {
-                "time_s": self.k * self.interval,
-                "state": "growing" if ending is None else ending.value.lower(),
-                "control": control,
-                "alarms": sum(bit for bit, holds in bits.items() if holds),
-                "valid": seen.valid > 0.5,
-                "watchdog": max(self.answered, 0),
-                "step": self.k,
-            }
-        )
-        for applied, limits in zip(APPLIED, self.limits.values(), strict=True):
+        values = self._fixed | in_plant_units(seen, self.puller) | dict(zip(SETPOINTS, self._active, strict=True))
+        values |= {
+            "time_s": self.k * self.interval, "state": "growing" if ending is None else ending.value.lower(),
+            "control": control, "alarms": sum(bit for bit, holds in bits.items() if holds),
+            "valid": seen.valid > 0.5, "watchdog": max(self.answered, 0), "step": self.k,
+        }  # fmt: skip
+        for applied, limits in zip(SETPOINTS.values(), self.limits.values(), strict=True):
             values[applied] = np.clip(values[applied], *limits)  # actions are in single precision
         tags = {tag.name: tag.kind(values[tag.name]) for tag in TAGS}
         self.hour.append(tags)

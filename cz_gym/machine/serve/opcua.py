@@ -120,9 +120,8 @@ class Writes(AttributeService):  # type: ignore[misc]
                 codes[at] = ua.StatusCodes.BadUserAccessDenied if self.machine.manual else ua.StatusCodes.BadOutOfRange
             if codes[at]:
                 value = each.Value.Value.Value if each.Value.Value is not None else None
-                self.door.refused(
-                    f"{user.name}: {name} = {value!r:.40}: {reasons.get(name) or ua.StatusCode(codes[at]).name}"
-                )
+                reason = reasons.get(name) or ua.StatusCode(codes[at]).name
+                self.door.refused(f"{user.name}: {name} = {value!r:.40}: {reason}")
         if any(codes):
             return [ua.StatusCode(code or ua.StatusCodes.BadInvalidState) for code in codes]
         for each in params.NodesToWrite:
@@ -228,9 +227,10 @@ async def certify(folder: Path) -> None:
     mask = os.umask(0o077)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        use, made = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH], folder / "certificate.der"
-        await setup_self_signed_certificate(key, made, URI, gethostname(), use, {"commonName": "Cz-v0 virtual puller"})
-        certificate.write_text(ssl.DER_cert_to_PEM_cert(made.read_bytes()))
+        use, der = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH], folder / "certificate.der"
+        await setup_self_signed_certificate(key, der, URI, gethostname(), use, {"commonName": "Cz-v0 virtual puller"})
+        certificate.write_text(ssl.DER_cert_to_PEM_cert(der.read_bytes()))
+        der.unlink()
     finally:
         os.umask(mask)
 

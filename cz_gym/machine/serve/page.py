@@ -14,9 +14,10 @@ from aiohttp import BasicAuth, web
 from plotly.offline import get_plotlyjs
 
 from cz_gym.errors import CzError
+from cz_gym.machine.export.ports import SETPOINTS
 from cz_gym.rendering.canvas import load
 
-from .machine import SETPOINTS, Alarm, Machine
+from .machine import Alarm, Machine
 from .opcua import Account, Door, in_address
 
 HTML = Path(__file__).parent / "page.html"

@@ -34,11 +34,7 @@ def test_compensator_is_the_ideal_one_but_for_unstable_poles_and_steady_gain(mod
 
 
 def test_a_plant_without_compensator_and_a_bad_cut_off_are_refused():
-    for given, said in (
-        ((MODEL_II,), "two stable"),
-        ((MODEL_I, -MODEL_I.poles[1]), "two stable"),
-        ((MODEL_I, 0.0), "cut"),
-    ):
+    for said, *given in (("two stable", MODEL_II), ("two stable", MODEL_I, -MODEL_I.poles[1]), ("cut", MODEL_I, 0.0)):
         with pytest.raises(CzError, match=said):
             design_compensator(*given)
 

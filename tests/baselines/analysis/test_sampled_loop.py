@@ -68,12 +68,9 @@ def late(controller, samples):
     camera[0, 0] = 1.0
     for _ in range(samples):
         A, B, C, D = controller
-        controller = StateSpace(
-            np.block([[A, B @ camera.T], [np.zeros((1, len(A) + 1))]]),
-            np.vstack([B * (1.0 - camera), camera]),
-            np.hstack([C, D @ camera.T]),
-            D * (1.0 - camera),
-        )
+        A = np.block([[A, B @ camera.T], [np.zeros((1, len(A) + 1))]])
+        B, C = np.vstack([B * (1.0 - camera), camera]), np.hstack([C, D @ camera.T])
+        controller = StateSpace(A, B, C, D * (1.0 - camera))
     return controller
 
 
@@ -153,20 +150,18 @@ def test_noise_gains_are_those_of_the_simulated_plant():
 
 
 def test_controllers_that_are_not_linear_are_named():
-    class Offset(FilteredPID):
-        def predict(self, *args, **kwargs):
-            action, memory = super().predict(*args, **kwargs)
-            return action + np.float32(0.1), memory
+    def changed(change):
+        class Changed(FilteredPID):
+            def predict(self, *args, **kwargs):
+                action, memory = super().predict(*args, **kwargs)
+                return change(action), memory
 
-    class Squared(FilteredPID):
-        def predict(self, *args, **kwargs):
-            action, memory = super().predict(*args, **kwargs)
-            return np.sign(action) * np.square(action), memory
+        return Changed()
 
-    with pytest.raises(NotLinearError, match="Offset does not rest"):
-        linear_controller(Offset())
-    with pytest.raises(NotLinearError, match="Squared is not linear"):
-        linear_controller(Squared())
+    with pytest.raises(NotLinearError, match="Changed does not rest"):
+        linear_controller(changed(lambda action: action + np.float32(0.1)))
+    with pytest.raises(NotLinearError, match="Changed is not linear"):
+        linear_controller(changed(lambda action: np.sign(action) * np.square(action)))
     with pytest.raises(NotLinearError, match="no loop"):
         linear_form(OpenLoop())
 

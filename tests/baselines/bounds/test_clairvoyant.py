@@ -135,12 +135,8 @@ def test_the_clairvoyant_optimum_within_tight_limits_is_a_general_optimisers():
 
 
 def test_slow_narrow_and_stepping_drives_are_respected_and_followed():
-    actuators = Actuators(
-        pull_window=0.05 * MM_PER_MIN,
-        pull_slew=0.06 * MM_PER_MIN / MINUTE,
-        heater_slew=0.2 * KILO / MINUTE,
-        heater_step=0.1 * KILO,
-    )
+    pull = {"pull_window": 0.05 * MM_PER_MIN, "pull_slew": 0.06 * MM_PER_MIN / MINUTE}
+    actuators = Actuators(**pull, heater_slew=0.2 * KILO / MINUTE, heater_step=0.1 * KILO)
     config, policy = planned(replace(HARD, name="narrow", actuators=actuators))
     u, u_0 = policy.best.u, policy.inputs_0
     pull, power = u[:, :, 0] - u_0[:, 0], u[:, :, 1] - u_0[:, 1]

@@ -42,17 +42,12 @@ def test_an_outlier_counts_as_the_gate_and_no_more(sign):
 
 
 def test_the_noise_of_a_sensor_is_found_from_the_innovations():
-    rng = np.random.default_rng(2)
-    sds = np.array([0.2, 1.0, 3.0])
-    predicted = np.full(3, 0.3)
-    variance = np.ones(3)
-    averages = []
+    rng, sds = np.random.default_rng(2), np.array([0.2, 1.0, 3.0])
+    predicted, variance, averages = np.full(3, 0.3), np.ones(3), []
     for _ in range(20000):
         innovation = rng.normal(size=3) * np.sqrt(predicted + sds**2)
-        variance = kalman.matched_variance(
-            variance, innovation, predicted, np.ones(3, bool), 0.999, (1e-4, 100.0), np.inf
-        )
-        averages.append(variance)
+        how = np.ones(3, bool), 0.999, (1e-4, 100.0), np.inf
+        averages.append(variance := kalman.matched_variance(variance, innovation, predicted, *how))
     np.testing.assert_allclose(np.mean(averages[4000:], axis=0), sds**2, rtol=0.1)
 
 

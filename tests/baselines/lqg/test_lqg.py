@@ -69,13 +69,8 @@ def brute_force_first_move(model, weights, dt, z, steps, reference_steps, drift_
         if k < len(drift_steps):
             free[DRIFT] += drift_steps[k]
             radius += reference_steps[k]
-        terms = (
-            (Q[0, 0], forced[0], free[0] - radius),
-            (pull, forced[n], free[n]),
-            (moves[0], move[0], 0.0),
-            (moves[1], move[1], 0.0),
-        )
-        for weight, row, offset in terms:
+        costs = (Q[0, 0], forced[0], free[0] - radius), (pull, forced[n], free[n])
+        for weight, row, offset in (*costs, (moves[0], move[0], 0.0), (moves[1], move[1], 0.0)):
             rows.append(np.sqrt(weight) * row)
             targets.append(-np.sqrt(weight) * offset)
     unknown_scale = np.tile([1e-6, 1e3], steps)

@@ -85,10 +85,8 @@ def with_and_without_search(sensor):
     """Metrics on crystals with that camera: with the search for a ripple, and with the latency alone."""
     scenario = Scenario("camera", interface=Interface(sd=(0.2, 0.2)), sensor=sensor)
     config = make_config(scenario, horizon=3600.0, **PLAIN)
-    policies = (
-        LQG(design=replace(BEST_RETURN.design(RANDOMIZED), ring=ring)) for ring in (PULLER_RING, RingModel(5.0))
-    )
-    return [metrics(rollout(policy, config, range(12))) for policy in policies]
+    designs = (replace(BEST_RETURN.design(RANDOMIZED), ring=ring) for ring in (PULLER_RING, RingModel(5.0)))
+    return [metrics(rollout(LQG(design=design), config, range(12))) for design in designs]
 
 
 def test_where_there_is_no_ripple_the_search_for_one_costs_little():

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from cz_gym.machine.identify import __main__ as command
+from cz_gym.machine.identify import command
 from cz_gym.machine.puller import read_puller
 from examples import identify as example
 from studies import identify as study
@@ -70,8 +70,10 @@ def test_what_is_wrong_is_one_line_and_nothing_is_written(options, said, logs, t
 
 
 @pytest.mark.slow
-def test_the_study_identifies_pullers_that_nobody_knows(tmp_path, capsys):
-    assert study.main(["--quick", "--out", str(tmp_path)]) == 0
+def test_the_study_identifies_pullers_that_nobody_knows(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(study, "PULLERS", 3)
+    monkeypatch.setattr(study, "CRYSTALS", 4)
+    assert study.main(["--out", str(tmp_path)]) == 0
     text = (tmp_path / "pullers.txt").read_text()
     assert text in capsys.readouterr().out
     assert "tell the pull speed's path: 0\n" in text

@@ -13,7 +13,7 @@ from cz_gym.baselines.registry import make_controller
 from cz_gym.episodes.scenario import Reference
 from cz_gym.errors import CzError
 from cz_gym.machine.identify import Excited, identify, read_log, record_log
-from cz_gym.machine.identify.__main__ import main
+from cz_gym.machine.identify.command import main
 from cz_gym.machine.identify.estimate import HEATER, LAGS, PULL
 from cz_gym.machine.identify.excitation import CHIPS, SEQUENCE
 from cz_gym.machine.identify.grid import Log, prepare, shift_drives
@@ -22,6 +22,7 @@ from cz_gym.machine.identify.moves import measure_excitation
 from cz_gym.machine.identify.verdict import coloured
 from cz_gym.machine.puller import DEFAULT, find_puller
 from cz_gym.observation import MEASURED, decode
+from studies.other_machine import SLOW
 from tests.foreign_puller import ForeignPuller, Operator, drive, write_log
 from tests.machine.identify.conftest import OWN, TRUTH
 
@@ -66,16 +67,9 @@ def test_the_heat_is_the_power_late_and_slow(dead_time, lag):
 
 
 def test_slow_drives_count_and_a_limit_does_not(tmp_path):
-    slow = {
-        "heater_slew": 1e3 / 60,
-        "heater_step": 50.0,
-        "pull_slew": 0.2 / 60,
-        "pull_window": 0.3,
-        "camera_noise": 0.05,
-    }
     for seed in range(5):
-        for moves, limits in ((0.025, slow), (0.0, slow), (0.0, {})):
-            puller = ForeignPuller(seed=seed, feels=False, **limits)
+        for moves, limits in ((0.025, SLOW), (0.0, SLOW), (0.0, {})):
+            puller = ForeignPuller(seed=seed, **limits)
             rows = drive(puller, Operator(puller, seed, (moves, moves)).setpoints)
             log = read_log(write_log(tmp_path / "log.csv", rows))
             cut = [np.mean(np.abs(move) > 0.98 * np.abs(move).max()) for move in (np.diff(log.v_p), np.diff(log.Q_H))]

@@ -12,8 +12,6 @@ from cz_gym.machine.identify.log import check_puller, column_map, read_log
 from cz_gym.machine.puller import DEFAULT
 from tests.foreign_puller import ForeignPuller, Operator, drive, write_log
 
-Row = dict[str, str]
-
 
 def read(path):
     return list(csv.DictReader(path.read_text().splitlines()))
@@ -30,17 +28,15 @@ def test_other_names_units_and_separators_are_the_same_log(logs, tmp_path):
     rows = [
         {
             "when": (start + timedelta(seconds=float(row["time_s"]))).isoformat(),
-            "DIA": f"{0.2 * float(row['ring_radius_mm']):.12g}".replace(".", ","),
-            "SPEED": f"{60.0 * float(row['pull_speed_mm_per_min']):.12g}".replace(".", ","),
-            "W": f"{1e3 * float(row['heater_power_kW']):.12g}".replace(".", ","),
-            "PYRO": f"{float(row['T_1_K']) - 273.15:.12g}".replace(".", ","),
-            "valid": row["valid"],
+            "DIA": f"{0.2 * float(row['ring_radius_mm']):.12g}", "W": f"{1e3 * float(row['heater_power_kW']):.12g}",
+            "SPEED": f"{60.0 * float(row['pull_speed_mm_per_min']):.12g}",
+            "PYRO": f"{float(row['T_1_K']) - 273.15:.12g}", "valid": row["valid"],
         }
         for row in read(logs[0])
-    ]
+    ]  # fmt: skip
     (tmp_path / "map.toml").write_text('ring_radius_mm = "DIA:diameter cm"\npull_speed_mm_per_min = "SPEED:mm/h"\n')
     columns = column_map(["time_s=when:iso", "heater_power_kW=W:W", "T_1_K=PYRO:degC"], tmp_path / "map.toml")
-    mine, other = read_log(logs[0]), read_log(write(tmp_path / "other.csv", rows, ";"), columns)
+    mine, other = read_log(logs[0]), read_log(write(tmp_path / "other.csv", german(rows), ";"), columns)
     for name in ("time", "ring", "v_p", "Q_H", "T_1"):
         np.testing.assert_allclose(getattr(other, name), getattr(mine, name), rtol=1e-9, err_msg=name)
     assert np.isnan(other.r_ref).all()

@@ -13,7 +13,7 @@ pytest.importorskip("asyncua", reason="asyncua is absent: pip install '.[plant]'
 from asyncua import Client, ua
 from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 
-from cz_gym.machine.serve.__main__ import commands, door_of, serving
+from cz_gym.machine.serve.command import commands, door_of, serving
 from cz_gym.machine.serve.machine import TAGS
 from cz_gym.machine.serve.opcua import KINDS, URI
 
@@ -88,10 +88,8 @@ async def connected(url, act, user="", password=PASSWORD, keys=None):
         client.set_password(password)
     if keys:
         client.application_uri = URI
-        certificate = keys / "certificate.pem"
-        await client.set_security(
-            SecurityPolicyBasic256Sha256, certificate, keys / "key.pem", server_certificate=str(certificate)
-        )
+        own = keys / "certificate.pem", keys / "key.pem"
+        await client.set_security(SecurityPolicyBasic256Sha256, *own, server_certificate=str(own[0]))
     async with client:
         return await act(Hand(client, await client.get_namespace_index(f"{URI}:tags")))
 

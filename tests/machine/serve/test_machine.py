@@ -9,9 +9,10 @@ import pytest
 
 from cz_gym.config import make_config
 from cz_gym.errors import CzError
+from cz_gym.machine.export.ports import SETPOINTS
 from cz_gym.machine.puller import PullerFile
 from cz_gym.machine.serve.files import Log, StateFile
-from cz_gym.machine.serve.machine import SETPOINTS, Alarm, Clock, Machine
+from cz_gym.machine.serve.machine import Alarm, Clock, Machine
 
 PULL, HEATER = SETPOINTS
 

@@ -15,9 +15,9 @@ import urllib.request
 import numpy as np
 import pytest
 
+from cz_gym.machine.export.ports import SETPOINTS
 from cz_gym.machine.identify.log import read_log
-from cz_gym.machine.serve import __main__ as command
-from cz_gym.machine.serve.machine import SETPOINTS
+from cz_gym.machine.serve import command
 from tests.machine.serve.conftest import PASSWORD, answer, connected, free_port, running, with_client
 from tests.processes import ROOT
 
@@ -86,15 +86,13 @@ def test_tags_say_their_units_and_ranges(puller):
     async def act(hand):
         async def about(name):
             parts = [await each.read_value() for each in await hand.nodes[name].get_properties()]
-            return [
-                each.DisplayName.Text if isinstance(each, ua.EUInformation) else (each.Low, each.High) for each in parts
-            ]
+            unit = ua.EUInformation
+            return [each.DisplayName.Text if isinstance(each, unit) else (each.Low, each.High) for each in parts]
 
         assert await about("step") == []
         assert await about("watchdog_s") == ["s"]
-        assert (
-            await about(PULL) == await about("pull_speed_mm_per_min") == ["mm/min", tuple(puller.machine.limits[PULL])]
-        )
+        span = tuple(puller.machine.limits[PULL])
+        assert await about(PULL) == await about("pull_speed_mm_per_min") == ["mm/min", span]
         unit, (low, high) = await about("T_1_K")
         assert unit == "K"
         assert low < await hand.read("T_1_K") < high
@@ -232,7 +230,8 @@ def test_a_reader_reads_and_an_operator_writes(locked):
     assert encrypted(locked, act, "rita", PASSWORD)[1] == ["BadUserAccessDenied"] * 3
     assert encrypted(locked, act, "olga", PASSWORD)[1] == ["Good"] * 3
     assert any(line.endswith(f"reader rita: {PULL} = 1.2: BadUserAccessDenied") for line in locked.door.events)
-    assert (locked.folder / "certificates" / "key.pem").stat().st_mode & 0o077 == 0
+    files = {file.name: file.stat().st_mode & 0o077 for file in (locked.folder / "certificates").iterdir()}
+    assert files == {"certificate.pem": 0, "key.pem": 0}
 
 
 def encrypted(puller, act, user, password):
@@ -265,7 +264,7 @@ def test_the_page_elsewhere_is_encrypted_and_only_an_operator_sets_drives(locked
 def test_a_killed_server_leaves_a_whole_log_and_goes_on_with_the_same_crystal(tmp_path):
     log = tmp_path / "log.csv"
     options = ["--speed", "2000", "--port", str(free_port()), "--page-port", "0", "--log", str(log)]
-    command_line = [sys.executable, "-m", "cz_gym.machine.serve", *options, "--state", str(tmp_path / "state")]
+    command_line = [sys.executable, "-m", "cz_gym", "serve", *options, "--state", str(tmp_path / "state")]
 
     def killed_at(rows):
         server = subprocess.Popen(command_line, cwd=ROOT, stdout=subprocess.PIPE)

@@ -1,7 +1,6 @@
 """Identify a puller from its logs: ``cz-gym identify LOG.csv --puller start.toml --out my.toml``."""
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -67,7 +66,3 @@ def _prior(text: str) -> tuple[str, float]:
         return name, float(sd)
     except ValueError:
         raise CzError(f"--prior {text}: write it as NAME=SD") from None
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -4,7 +4,6 @@ import argparse
 import asyncio
 import logging
 import math
-import sys
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from ipaddress import ip_address
@@ -112,7 +111,3 @@ def _serve(arguments: argparse.Namespace) -> None:
             await pumping
 
     asyncio.run(run())
-
-
-if __name__ == "__main__":
-    sys.exit(main())

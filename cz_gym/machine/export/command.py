@@ -26,10 +26,10 @@ WRITERS: dict[str, Any] = {"c": write_c, "st": write_st, "onnx": write_onnx}
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the files; 0 when done, 2 for bad input."""
-    parser = OneLineParser(
-        "cz-gym export",
-        "Write a controller, with what a plant needs around it, as C99, structured text or ONNX; or the puller as FMU.",
+    about = (
+        "Write a controller, and what a plant needs around it, as C99, structured text or ONNX; or the puller as FMU."
     )
+    parser = OneLineParser("cz-gym export", about)
     add = parser.add_argument
     add("controller", nargs="?", help="a classical controller, a shipped agent, or an agent file (.onnx)")
     add("--plant", action="store_true", help="the puller in place of a controller (--to fmu)")
@@ -48,9 +48,7 @@ def _export(given: argparse.Namespace) -> None:
     if not asked or given.plant != fmu or given.plant == bool(given.controller):
         raise CzError("name a controller and --to c, st or onnx, or --shadow LOG; or --plant --to fmu")
     if given.scenario and given.puller and not given.plant:
-        raise CzError(
-            "--scenario is for the default puller: a puller file has settings of its own, whatever the scenario"
-        )
+        raise CzError("--scenario is for the default puller: a puller file has settings whatever the scenario")
     config = make_config(given.scenario or "puller", observation="measured", action="direct", puller=given.puller)
     if given.plant:
         from .fmu import build_fmu
@@ -89,7 +87,3 @@ def readme(block: Block, files: list[str], single: bool) -> str:
         "alarms": "\n".join(f"| {bit.value} | `{bit.name}` | {text} |" for bit, text in meanings(Alarm).items()),
     }
     return fill_template("block.md", parts | {"name": program.name, "about": "  \n".join(program.notes)})
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
