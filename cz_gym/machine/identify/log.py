@@ -18,6 +18,9 @@ from cz_gym.support.units import KILO, MM, MM_PER_MIN
 from .grid import Log, on_grid, sound_rows
 from .table import COLUMNS, REQUIRED, numbers, text_table, times
 
+BODY, CONE = 0.15, 0.02
+"""Largest deviation of the ring in a body, in radii, and the share of rows beyond it that a cone has at least."""
+
 
 def column_map(given: Sequence[str], file: Path | None = None) -> dict[str, tuple[str, str]]:
     """Names and units of a log's columns, by standard name, from ``NAME=COLUMN[:UNIT]`` and a TOML file.
@@ -102,6 +105,12 @@ def check_puller(log: Log, machine: PullerFile, source: str = "the log") -> None
         middle, low, high = (value / own for value in (middle, low, high))
         raise CzError(
             f"{source}: {name} is {middle:.4g} in the middle, this puller's is {low:.4g} to {high:.4g}: {guess}?"
+        )
+    off = np.abs(log.ring - puller.ring_bias - puller.r_0) > BODY * puller.r_0
+    if off.sum() > CONE * np.isfinite(log.ring).sum():
+        raise CzError(
+            f"{source}: in {off.sum()} of {off.size} rows the ring is more than {BODY * puller.r_0 / MM:.0f} mm from "
+            f"the body's: identification fits the body alone, so cut crown and tail off"
         )
 
 

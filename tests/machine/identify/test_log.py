@@ -223,3 +223,11 @@ def test_wrong_units_and_other_pullers_are_noticed(factor, said, logs):
     wrong = log._replace(**{name: getattr(log, name) * by for name, by in factor.items()})
     with pytest.raises(CzError, match=said.replace("(", r"\(")):
         check_puller(wrong, DEFAULT)
+
+
+def test_a_log_of_a_cone_is_refused(logs):
+    log = read_log(logs[0])
+    crown = np.linspace(0.3, 2.0, len(log.ring)).clip(max=1.0)
+    for shape in (crown, crown[::-1]):
+        with pytest.raises(CzError, match=r"more than 13 mm from the body's: .* cut crown and tail off"):
+            check_puller(log._replace(ring=log.ring * shape), DEFAULT)
