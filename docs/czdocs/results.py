@@ -115,7 +115,7 @@ def faults() -> Lines:
     """Radius error and lost crystals of each block under each fault."""
     cells: dict[str, list[str]] = {}
     controllers = dict[str, None]()
-    for controller, _, fault, error, _, lost, _ in rows_of("faults/report.md")[1:]:
+    for controller, fault, error, _, lost, _ in rows_of("faults/report.md")[1:]:
         controllers[controller] = None
         cells.setdefault(fault, []).extend((error, lost))
     head = [each for name in controllers for each in (f"{code(name)} [mm]", "lost")]
