@@ -49,8 +49,8 @@ __all__ = [
 gym.register(id=ENV_ID, entry_point="cz_gym.env:CzEnv", vector_entry_point="cz_gym.vector:CzVectorEnv")
 gym.register(
     id="CzCrystal-v0",
-    entry_point="cz_gym.crystal.env:CzCrystalEnv",
-    vector_entry_point="cz_gym.crystal.env:CzCrystalVectorEnv",
+    entry_point="cz_gym.crystal_env:CzCrystalEnv",
+    vector_entry_point="cz_gym.crystal_env:CzCrystalVectorEnv",
 )
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from cz_gym.commands import recipe as command
 from cz_gym.config import make_config
-from cz_gym.crystal.env import CzCrystalEnv
 from cz_gym.crystal.linearisation import along
 from cz_gym.crystal.process import CRYSTAL, nominal_recipe
+from cz_gym.crystal_env import CzCrystalEnv
 from cz_gym.errors import CzError
 from cz_gym.machine.puller import DEFAULT, PullerFile, find_puller, from_toml
 from cz_gym.physics.meniscus import HURLE

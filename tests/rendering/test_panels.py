@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import trapezoid
 
 from cz_gym import HURLE, CzEnv, Parameters, make_puller
-from cz_gym.crystal.env import CzCrystalEnv
+from cz_gym.crystal_env import CzCrystalEnv
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.rendering import palette, scene, triple_point

@@ -2,10 +2,9 @@
 
 from typing import Any
 
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.env import CzEnv
 from cz_gym.vector import CzVectorEnv
-
-from .process import CRYSTAL
 
 
 class CzCrystalEnv(CzEnv):
