@@ -1,8 +1,8 @@
 """A linear quadratic Gaussian regulator of a whole crystal: Kalman filter and regulator at each length of the recipe.
 
-Both are solved for the linearisation at some lengths, as if the crystal stayed there, and interpolated between. The
-model has three states that are not the plant's: the interface's slow fluctuation, the drift of the hot zone, which
-the recipe that is given follows, and the error of that recipe. SI units.
+Both are solved for the linearisation at some lengths, as if the crystal stayed there, and interpolated between, once
+for each of several shares of conduction. The model has three states that are not the plant's: the interface's slow
+fluctuation, the drift of the hot zone, which the recipe that is given follows, and the error of that recipe. SI units.
 """
 
 import math
@@ -59,6 +59,8 @@ class Weights(NamedTuple):
 
     radius: float = 0.5 * MM
     height: float = 0.4 * MM
+    cones: float = 1.0
+    """The height's deviation in crown and tail, in multiples of the body's [-]."""
     pull: float = 0.3 * MM_PER_MIN
     pull_step: float = 0.06 * MM_PER_MIN
     power: float = 4.0 * KILO
@@ -85,9 +87,10 @@ def design(parameters: Any, meniscus: MeniscusModel, dt: float, lam: float, nois
     """Design filter and regulator for a control interval [s]."""
     at = along(parameters, meniscus, lam)
     walks = noise.height * in_cones(noise.cones, at.L, parameters)
+    heights = weights.height * in_cones(weights.cones, at.L, parameters)
     designs = [
-        _at(A, B, C, at.load, dt, noise._replace(height=float(walk)), weights)
-        for A, B, C, walk in zip(at.A, at.B, at.C, walks, strict=True)
+        _at(A, B, C, at.load, dt, noise._replace(height=float(walk)), weights._replace(height=float(height)))
+        for A, B, C, walk, height in zip(at.A, at.B, at.C, walks, heights, strict=True)
     ]
     return Gains(at.L, *(np.stack(each) for each in zip(*designs, strict=True)))
 

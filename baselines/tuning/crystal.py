@@ -58,6 +58,7 @@ DESIGN = (
     Parameter("noise.cones", 0.3, 10.0),
     Parameter("noise.recipe", 0.1, 30.0),
     Parameter("weights.height", 0.03 * MM, 3.0 * MM),
+    Parameter("weights.cones", 0.1, 3.0),
     Parameter("weights.pull", 0.01 * MM_PER_MIN, 3.0 * MM_PER_MIN),
 )
 
@@ -144,8 +145,17 @@ CRYSTALS = (
         name="lqg-along",
         meaning="Kalman filter and regulator designed along the recipe",
         start=CrystalLQG(
-            noise=Noise(height=1.5e-5, cones=2.0, temperature=2e-3, fluctuation=0.3, tau=600.0, drift=5.0),
-            weights=Weights(radius=0.4 * MM, height=0.3 * MM, pull=0.1 * MM_PER_MIN, power_step=1.6 * KILO),
+            noise=Noise(
+                ring=0.08 * MM,
+                height=1.5e-5,
+                cones=2.0,
+                temperature=2e-3,
+                fluctuation=0.3,
+                tau=600.0,
+                drift=5.0,
+                recipe=6.0,
+            ),
+            weights=Weights(radius=0.4 * MM, height=0.3 * MM, cones=0.3, pull=0.1 * MM_PER_MIN, power_step=1.6 * KILO),
         ),
         parameters=DESIGN,
         quoted=True,

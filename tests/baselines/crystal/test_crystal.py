@@ -21,9 +21,9 @@ CROWN = Row("crown", "randomized", "a crown", process=CRYSTAL, stage="crown")
     ("name", "least", "most", "error"),
     [
         ("ring-pid", 0, 0, 8.0),
-        ("ring-pid-reduced", 9, 12, 8.0),
-        ("compensated", 10, 12, 6.0),
-        ("lqg-along", 11, 12, 5.0),
+        ("ring-pid-reduced", 10, 12, 6.0),
+        ("compensated", 10, 12, 3.0),
+        ("lqg-along", 12, 12, 2.5),
         ("true-radius", 12, 12, 1.0),
     ],
 )
