@@ -187,7 +187,9 @@ PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64))
 RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG())}
 """Recipes by name: the choices of ``train.py --algo``."""
 _along: dict[str, Any] = {"environment": CRYSTAL, "stages": ("crown", "body", "tail"), "scenario": "randomized"}
-CRYSTAL_RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in (PPO(**_along), APG(num_envs=96, steps=8_640_000, **_along))}
+CRYSTAL_RECIPES: dict[str, Recipe] = {
+    recipe.name: recipe for recipe in (PPO(**_along), APG(num_envs=96, steps=8_640_000, **_along))
+}
 """Recipes of CzCrystal-v0: one agent for crown, body and tail."""
 DEFAULT = "ppo"
 """The recipe that train.py follows unless another is named."""
