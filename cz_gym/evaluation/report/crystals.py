@@ -122,7 +122,8 @@ def draw(result: Result) -> bytes:
     ends = float(longest.L[0] / MM), float(longest.L[-1] / MM)
     tall = min(TALLEST, WIDE / len(samples) * (ends[1] - ends[0]) / (2.0 * room) + 0.5)
     figure = canvas(WIDE, tall + 1.15 * len(_PANELS) + 1.0)
-    above, below = figure.subfigures(2, 1, height_ratios=(tall + 0.3, 1.15 * len(_PANELS)))
+    halves: Any = figure.subfigures(2, 1, height_ratios=(tall + 0.3, 1.15 * len(_PANELS)))
+    above, below = halves
     profiles = above.subplots(1, len(samples), sharex=True, sharey=True, squeeze=False)[0]
     for axis, sample in zip(profiles, samples, strict=True):
         s, look = signals[sample.name], style[sample.name]
