@@ -1,4 +1,4 @@
-"""Why SAC learns slowly here: ``python -m studies.critic`` trains the recipe ``sac``, changed by FIELD=VALUE.
+"""Why SAC learns slowly: ``python -m studies.critic`` trains the recipe ``sac``, changed by FIELD=VALUE.
 
 SAC follows its critic's slope by the action. After training this slope is compared with the true one: from each of many
 crystals the first action is changed by a little, up and down, and the agent goes on; both futures meet the same
