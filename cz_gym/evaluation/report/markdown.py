@@ -13,7 +13,7 @@ from cz_gym.machine.puller import DEFAULT
 from cz_gym.support.units import HOUR, MM, PERCENT
 
 from . import grower
-from .canvas import COLUMNS, chosen
+from .canvas import chosen
 from .contents import contents_of
 from .tables import (
     NOTHING,
@@ -28,6 +28,8 @@ from .tables import (
 )
 from .tables import markdown as table
 
+ROWS = 6
+"""Number of controllers in a page's short table."""
 MARKERS = "<!-- {}:begin -->", "<!-- {}:end -->"
 """Markers around the part of a page that :func:`fill_in` writes."""
 
@@ -42,11 +44,11 @@ def summary(results: Sequence[Result]) -> str:
 
 
 def brief(results: Sequence[Result]) -> str:
-    """Return :func:`summary` of the random scenarios, of the controllers that the figure of a crystal shows."""
+    """Return :func:`summary` of the random scenarios, of the controllers that a figure would show first."""
     first, *others = deciding(results)
     if first.row.process is CRYSTAL:
         return summary(results)
-    return summary([replace(first, samples=tuple(chosen(first.samples, COLUMNS))), *others])
+    return summary([replace(first, samples=tuple(chosen(first.samples, ROWS))), *others])
 
 
 def fill_in(page: str, results: Sequence[Result]) -> str:
