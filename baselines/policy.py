@@ -106,7 +106,7 @@ class MeasuredController(ABC):
         """Arguments of ``gym.make("Cz-v0", ...)`` for the environment that it was made for."""
         given = {"observation": self.observation, "action": self.action, "control_interval": self.control_interval}
         plant: dict[str, Any] = {"meniscus": (self.meniscus, HURLE), "puller": (self.puller, DEFAULT)}
-        if self.puller == DEFAULT and self.process is BODY:
+        if self.puller == DEFAULT and self.process == BODY:
             plant["parameters"] = self.parameters, Parameters()
         return given | {name: own for name, (own, default) in plant.items() if own != default}
 

@@ -115,7 +115,7 @@ CRYSTAL_CONTROLLERS: tuple[Contender, ...] = (
 
 def find_controller(name: str, process: Process = BODY) -> Contender:
     """The controller of that name for a process; CzError lists the known ones for another name."""
-    known = CRYSTAL_CONTROLLERS if process is CRYSTAL else CONTROLLERS
+    known = CRYSTAL_CONTROLLERS if process == CRYSTAL else CONTROLLERS
     for entry in known:
         if entry.name == name:
             return entry

@@ -81,7 +81,7 @@ def score(config: Config, seed: int, actions: Sequence[Action], failed: bool) ->
     if not failed:
         config = replace(config, horizon=len(actions) * config.control_interval)
     direct = replace(config, action="direct")
-    name, whose = ("compensated", "the compensated") if config.process is CRYSTAL else ("paper", "the paper's")
+    name, whose = ("compensated", "the compensated") if config.process == CRYSTAL else ("paper", "the paper's")
     rival = pkgutil.resolve_name(CONTROLLERS)(name, config.process).make(direct)
     results = []
     for policy, own in ((Playback(actions), config), (rival, direct)):

@@ -127,7 +127,7 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     if arguments.out is not None:  # a missing package is named before the work, not after it
         import matplotlib  # noqa: F401
         import plotly  # noqa: F401
-    bounds = None if arguments.puller or rows[0].process is CRYSTAL else BOUNDS
+    bounds = None if arguments.puller or rows[0].process == CRYSTAL else BOUNDS
     results = run(contenders, rows, arguments.episodes, CACHE, bounds, arguments.quiet, arguments.cluster)
     renewed = not smaller and arguments.out and arguments.out.resolve() == folder_of(arguments)
     quoted = (README, CRYSTAL_PAGE) if renewed else ()

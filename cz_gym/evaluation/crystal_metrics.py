@@ -112,12 +112,12 @@ def crystal_metrics(run: Rollout) -> CrystalMetrics:
 
 def kind_of(process: Process) -> Any:
     """The type of a process' metrics."""
-    return CrystalMetrics if process is CRYSTAL else Metrics
+    return CrystalMetrics if process == CRYSTAL else Metrics
 
 
 def measured(run: Rollout) -> Any:
     """The metrics of a rollout, of the type of its process."""
-    return crystal_metrics(run) if run.config.process is CRYSTAL else metrics(run)
+    return crystal_metrics(run) if run.config.process == CRYSTAL else metrics(run)
 
 
 def _mean(values: Floats, dt: float) -> Floats:

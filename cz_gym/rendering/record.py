@@ -171,4 +171,4 @@ class CrystalRecord(Record):
 
 def record_for(config: Config, slot: Any, scenario: str) -> Record:
     """An empty record for an episode of an environment."""
-    return (CrystalRecord if config.process is CRYSTAL else Record)(config, slot, scenario)
+    return (CrystalRecord if config.process == CRYSTAL else Record)(config, slot, scenario)

@@ -1,5 +1,7 @@
 """The metrics of whole crystals: energy against the recipe's balance, ways to lose a crystal, shares of its length."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from cz_gym.config import make_config
 from cz_gym.crystal import recipe
 from cz_gym.crystal.process import CRYSTAL, nominal_recipe
 from cz_gym.crystal.task import WAYS, room
-from cz_gym.evaluation.crystal_metrics import KWH, crystal_metrics
+from cz_gym.evaluation.crystal_metrics import KWH, CrystalMetrics, crystal_metrics, measured
 from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.meniscus import HURLE
@@ -67,3 +69,10 @@ def test_a_frozen_crown_counts_once_and_with_the_largest_allowed_error():
     np.testing.assert_array_equal(m.crown_max_mm, 12.0)
     assert np.isnan([m.body_within_half, m.tail_max_mm, m.dopant_spread]).all()
     assert (m.hours < 0.3).all()
+
+
+def test_a_crystal_is_known_after_its_settings_went_to_another_process():
+    settings = make_config("nominal", None, "measured", action="direct", process=CRYSTAL, stage="tail")
+    config = pickle.loads(pickle.dumps(settings))
+    run = rollout(OpenLoop(), config, [1])
+    assert isinstance(measured(run), CrystalMetrics)

@@ -42,4 +42,4 @@ _CRYSTAL = Contents(
 
 def contents_of(row: Row) -> Contents:
     """The parts of the report of a row's process."""
-    return _CRYSTAL if row.process is CRYSTAL else _BODY
+    return _CRYSTAL if row.process == CRYSTAL else _BODY

@@ -46,14 +46,14 @@ def summary(results: Sequence[Result]) -> str:
 def brief(results: Sequence[Result]) -> str:
     """Return :func:`summary` of the random scenarios, of the controllers that a figure would show first."""
     first, *others = deciding(results)
-    if first.row.process is CRYSTAL:
+    if first.row.process == CRYSTAL:
         return summary(results)
     return summary([replace(first, samples=tuple(chosen(first.samples, ROWS))), *others])
 
 
 def fill_in(page: str, results: Sequence[Result]) -> str:
     """Return a page with :func:`brief` between its two markers; the page itself if it has none."""
-    first, last = (marker.format("crystal" if results[0].row.process is CRYSTAL else "benchmark") for marker in MARKERS)
+    first, last = (marker.format("crystal" if results[0].row.process == CRYSTAL else "benchmark") for marker in MARKERS)
     before, begin, rest = page.partition(first)
     _, end, after = rest.partition(last)
     return f"{before}{begin}\n{brief(results)}\n{end}{after}" if end else page
@@ -65,7 +65,7 @@ def markdown(results: Sequence[Result], command: str, figures: Iterable[str]) ->
     parts = [
         *(_verdict(results) if row.tolerance is None else _for_a_grower(results)),
         "# Benchmark",
-        *(_of_crystals(results) if row.process is CRYSTAL else _of_bodies(results)),
+        *(_of_crystals(results) if row.process == CRYSTAL else _of_bodies(results)),
         summary(results),
         *(f"![{name.removesuffix('.png')}]({name})" for name in figures),
         "## Who took part",

@@ -144,7 +144,7 @@ OWN = ("true", "camera")
 
 def crystal(results: Sequence[Result]) -> go.Figure:
     """Draw the first crystal of each scenario, one scenario at a time, under the controllers of :func:`chosen`."""
-    whole = results[0].row.process is CRYSTAL
+    whole = results[0].row.process == CRYSTAL
     panels = CRYSTAL_PANELS if whole else PANELS
     titles = [f"{panel.title} [{panel.unit}]" for panel in panels]
     figure = make_subplots(len(panels), 1, shared_xaxes=True, vertical_spacing=0.02, subplot_titles=titles)
@@ -169,7 +169,7 @@ def _draw(
 ) -> dict[str, Any]:
     """Add the lines of a scenario and return the ranges of its panels: those of the crystals that were not lost."""
     samples, interval = chosen(result.samples, COLUMNS), result.row.control_interval
-    by_length = result.row.process is CRYSTAL
+    by_length = result.row.process == CRYSTAL
     bias = 0.0 if by_length else ring_bias(result.row, result.seeds[0])
     step = max(round(POINT / interval), 1)
     time = {"x0": 0.5 * step * interval / MINUTE, "dx": step * interval / MINUTE}
