@@ -60,13 +60,14 @@ class Asymmetric(BasePolicy):
     """A policy whose critic reads the plant's true state behind the channels of "history"."""
 
     def __init__(self, observation_space: Any, *others: Any, **named: Any) -> None:
-        self.channels = len(layout(observation_space.shape[-1]).history)
+        self.width = observation_space.shape[-1]
+        self.channels = len(layout(self.width).history)
         """Number of channels that the actor reads."""
         super().__init__(observation_space, *others, **named)
 
     def predict(self, observation: Any, *others: Any, **named: Any) -> Any:
         """As stable-baselines3's; the true state may be missing from the observation."""
-        missing = self.observation_space.shape[0] - observation.shape[-1]
+        missing = self.width - observation.shape[-1]
         padding = ((0, 0),) * (observation.ndim - 1) + ((0, missing),)
         return super().predict(np.pad(observation, padding), *others, **named)
 
@@ -109,7 +110,8 @@ class StateCritic(ContinuousCritic):
 
     def __init__(self, *others: Any, **named: Any) -> None:
         super().__init__(*others, **named)
-        sight, actions = self.features_extractor, get_action_dim(self.action_space)
+        sight: Any = self.features_extractor
+        actions = get_action_dim(self.action_space)
         width = sight.features_dim + actions * (len(sight.layout.state) + 1 + actions)
         sizes = [width, *named["net_arch"]]
         for place in range(self.n_critics):

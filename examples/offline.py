@@ -164,7 +164,8 @@ def compare(name: str, seeds: int) -> list[tuple[str, ...]]:
     """Rows of the table for a dataset."""
     dataset, steps, make = load(name)
     recorded = np.array([each.rewards.sum() for each in dataset.iterate_episodes()])
-    rows = [(name, "its recorded returns", f"{100.0 * minari.get_normalized_score(dataset, recorded).mean():.1f}", "")]
+    rows: list[tuple[str, ...]] = []
+    rows += [(name, "its recorded returns", f"{100.0 * minari.get_normalized_score(dataset, recorded).mean():.1f}", "")]
     for learner, learn in LEARNERS.items():
         found = []
         for seed in range(seeds):

@@ -63,7 +63,7 @@ def slopes(model: Any, recipe: SAC) -> tuple[Floats, Floats]:
         less, other = earned(model, recipe, ahead, action - change)
         true[:, drive], grows = (more - less) / (2.0 * CHANGE), grows & one & other
     at = torch.as_tensor(action).requires_grad_(True)
-    torch.cat(model.critic(torch.as_tensor(observation), at), 1).mean(1).sum().backward()
+    torch.autograd.backward(torch.cat(model.critic(torch.as_tensor(observation), at), 1).mean(1).sum())
     return true[grows], np.asarray(at.grad, np.float64)[grows]
 
 
