@@ -48,7 +48,7 @@ def test_it_logs_in_over_an_encrypted_channel(tmp_path, monkeypatch):
         own = ["--certificates", str(tmp_path / "client"), "--steps", "3"]
         assert opcua_controller.main(["--url", puller.url, *login, *own]) == 0
         assert puller.machine.answered == 2
-    assert sorted(os.listdir(tmp_path / "client")) == ["certificate.der", "certificate.pem", "key.pem"]
+    assert sorted(os.listdir(tmp_path / "client")) == ["certificate.pem", "key.pem"]
 
 
 def test_a_server_that_is_not_there_and_a_controller_that_is_not_are_said_in_one_line(refused):

@@ -14,6 +14,9 @@ from .model import Lags
 LAGS, COLOURED = 20, 0.15
 """Lags at which prediction errors are correlated [rows], and the correlation above which the model does not fit [-];
 many rows make smaller ones significant."""
+SEEN = 0.05, 0.01 * MM
+"""Least standard deviation of prediction errors of pyrometer [K] and ring [m] that are judged: no camera and no pyrometer
+shows less, and a model need not be better."""
 FAR = 3.0
 """Standard deviations of its prior from which on an estimate stands at its end."""
 T_1_OFF, Q_H_OFF = 15.0, 0.06
@@ -35,7 +38,8 @@ def misfits(found: Any, puller: Any, away: Mapping[str, float]) -> tuple[str, ..
     judged = ((0, "pyrometer", heater), (1, "ring", True))
     reasons = [] if found.settled else ["the search has not settled"]
     for sensor, name, estimated in judged:
-        if estimated and (size := coloured(found.errors[:, sensor])) > COLOURED:
+        seen = np.nanstd(found.predicted.error[:, sensor]) > SEEN[sensor]
+        if estimated and seen and (size := coloured(found.errors[:, sensor])) > COLOURED:
             reasons.append(f"prediction errors of the {name} are coloured (correlation {size:.2f})")
     if heater:
         T_1, Q_H = np.nanmean(found.log.T_1), np.mean(found.log.Q_H)

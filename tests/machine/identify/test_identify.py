@@ -10,6 +10,7 @@ from cz_gym import CzEnv, Parameters
 from cz_gym.action import HEATER_RANGE, MadeFor
 from cz_gym.baselines.policy import OpenLoop
 from cz_gym.baselines.registry import make_controller
+from cz_gym.body.plant import make_puller
 from cz_gym.episodes.scenario import Reference
 from cz_gym.errors import CzError
 from cz_gym.machine.identify import Excited, identify, read_log, record_log
@@ -19,9 +20,10 @@ from cz_gym.machine.identify.excitation import CHIPS, SEQUENCE
 from cz_gym.machine.identify.grid import Log, prepare, shift_drives
 from cz_gym.machine.identify.model import LAM, Lags, Model, Noise, heating, predict, sensitivities
 from cz_gym.machine.identify.moves import measure_excitation
-from cz_gym.machine.identify.verdict import coloured
+from cz_gym.machine.identify.verdict import coloured, misfits
 from cz_gym.machine.puller import DEFAULT, find_puller
 from cz_gym.observation import MEASURED, decode
+from cz_gym.support.units import MM
 from studies.other_machine import SLOW
 from tests.foreign_puller import ForeignPuller, Operator, drive, write_log
 from tests.machine.identify.conftest import OWN, TRUTH
@@ -123,6 +125,17 @@ def test_a_log_with_excitation_tells_the_hot_zone(found):
     assert changed == set(told) - {"lam", *LAGS}, "what the log does not tell keeps its value"
     assert min(found.excitation) > 5.0
     assert max(map(coloured, found.errors.T)) < 0.1
+
+
+def test_coloured_errors_that_no_camera_would_show_are_no_misfit(found):
+    """A log whose camera has no noise shows how exact the model is, to some micrometres."""
+    slow = np.convolve(np.random.default_rng(0).standard_normal(len(found.errors)), np.ones(9), "same")
+    for size, said in ((0.004 * MM, 0), (0.03 * MM, 1)):
+        error = np.stack([found.predicted.error[:, 0], size * slow / slow.std()], axis=1)
+        errors = np.stack([found.errors[:, 0], slow], axis=1)
+        doubted = replace(found, errors=errors, predicted=found.predicted._replace(error=error))
+        puller = make_puller(found.puller.parameters)
+        assert sum("ring are coloured" in each for each in misfits(doubted, puller, {})) == said
 
 
 def test_a_log_of_a_controller_alone_tells_nothing(logs):
