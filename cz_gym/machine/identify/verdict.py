@@ -15,8 +15,8 @@ LAGS, COLOURED = 20, 0.15
 """Lags at which prediction errors are correlated [rows], and the correlation above which the model does not fit [-];
 many rows make smaller ones significant."""
 SEEN = 0.05, 0.01 * MM
-"""Least standard deviation of prediction errors of pyrometer [K] and ring [m] that are judged: no sensor shows less, and
-a model need not be better."""
+"""Least standard deviation of prediction errors of pyrometer [K] and ring [m] that are judged: no sensor shows less,
+and a model need not be better."""
 FAR = 3.0
 """Standard deviations of its prior from which on an estimate stands at its end."""
 T_1_OFF, Q_H_OFF = 15.0, 0.06
