@@ -38,6 +38,7 @@ CHANGE = 0.02
 TAIL = 0.98
 """Share of the crystals that count: a crystal that is nearly lost has slopes a thousand times as large [-]."""
 SCENARIOS = ("randomized", "hard", "puller")
+TITLE = "# What SAC's critics know of an action"
 HEADS = ("changed", "updates", "cosine, pull", "cosine, heater", *(f"cost, {name}" for name in SCENARIOS), "lost [%]")
 
 
@@ -125,9 +126,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(given: argparse.Namespace) -> None:
-    before = given.out.read_text().splitlines()[2:] if given.out.exists() else []
+    lines = given.out.read_text().splitlines() if given.out.exists() else []
+    before = [line for line in lines if line.startswith("|")][2:]
     head = markdown(HEADS, [row(given.changes, given.seed)]).splitlines()
-    text = "\n".join([*head[:2], *before, *head[2:]])
+    text = "\n".join([TITLE, "", *head[:2], *before, *head[2:]])
     print(text)
     write_files({given.out: f"{text}\n".encode()})
 
