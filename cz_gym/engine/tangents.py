@@ -143,7 +143,10 @@ def _drives_by(
 ) -> None:
     """Derivatives of the next inputs; whole steps of the heater are taken for a power that moves freely."""
     by, process = scratch(2, model.driven_by), model.process
-    derivatives(Inputs, next_inputs, (x, u, action, before), (drives, slot, interval, process), by)
+    if model.nominals > 0:
+        derivatives(Inputs, next_inputs, (x, u, action, before), (drives, slot, interval, process), by)
+    else:
+        derivatives(Inputs, next_inputs, (x, u, action), (before, drives, slot, interval, process), by)
     for drive in range(2):
         for j in range(model.extra):
             J[model.states + drive, j] = by[drive, j]
@@ -164,7 +167,10 @@ def _carried_by(J: Any, slot: Any, extra: Any, interval: Any, model: Any) -> Non
     if model.extras > 0:
         by, process = scratch(model.extras, model.carried_by), model.process
         nominal = Inputs(slot.v_p_nominal, slot.Q_H_nominal)
-        derivatives(process.Extra, process.carry, (extra, labelled(Inputs, slot), nominal), (interval,), by)
+        if model.nominals > 0:
+            derivatives(process.Extra, process.carry, (extra, labelled(Inputs, slot), nominal), (interval,), by)
+        else:
+            derivatives(process.Extra, process.carry, (extra, labelled(Inputs, slot)), (nominal, interval), by)
         for j in range(model.columns):
             for row in range(model.extras):
                 total = by[row, j - model.extra] if model.extra <= j < model.nominal else 0.0

@@ -1,7 +1,7 @@
 """The plant of a whole crystal: its limit, its balances, its order, and the meniscus down to the crown's start."""
 
 import math
-from typing import Any, NamedTuple
+from collections import namedtuple
 
 import numpy as np
 import pytest
@@ -51,19 +51,8 @@ def test_a_crystal_without_end_over_a_charge_without_end_is_the_body(lam, rng):
         np.testing.assert_allclose(mine, bodys, rtol=1e-12, atol=1e-12 * np.abs(bodys).max())
 
 
-class Audit(NamedTuple):
-    """The state, and the heat that came from outside less what left."""
-
-    r_c: Any
-    h_c: Any
-    T_1: Any
-    T_2: Any
-    T_b: Any
-    L: Any
-    A_s: Any
-    M_s: Any
-    N: Any
-    gained: Any
+Audit = namedtuple("Audit", (*State._fields, "gained"))
+"""The state, and the heat that came from outside less what left."""
 
 
 def audited(x, u, d, p, m):
