@@ -30,8 +30,6 @@ class Ending(Enum):
 class Record:
     """The samples of one episode, oldest first: signals of ``info`` in SI units, and quantities derived from them."""
 
-    environment = "Cz-v0"
-
     def __init__(self, config: Config, slot: Any, scenario: str) -> None:
         self.config, self.scenario = config, scenario
         self.puller = config.process.Constants(*slot["puller"].tolist())
@@ -128,8 +126,6 @@ class Record:
 
 class CrystalRecord(Record):
     """The samples of a whole crystal: its references are those of the recipe at the length grown."""
-
-    environment = "CzCrystal-v0"
 
     def __init__(self, config: Config, slot: Any, scenario: str) -> None:
         super().__init__(config, slot, scenario)

@@ -64,8 +64,8 @@ def _draw_header(canvas: Canvas, record: Record) -> None:
     """Scenario, time, length grown, and whether the crystal grows."""
     hours, rest = divmod(round(float(record.t[-1])), round(HOUR))
     minutes, seconds = divmod(rest, round(MINUTE))
-    canvas.text(10, 7, record.environment, size=14, bold=True)
-    canvas.text(14 + 9 * len(record.environment), 10, record.scenario, palette.FAINT, 11)
+    canvas.text(10, 7, record.config.process.name, size=14, bold=True)
+    canvas.text(14 + 9 * len(record.config.process.name), 10, record.scenario, palette.FAINT, 11)
     time, grown = f"{hours}:{minutes:02d}:{seconds:02d}", f"{record.length[-1] / MM:.1f} mm"
     for x, name, value in ((204, "time", time), (312, "grown", grown)):
         canvas.text(x, 10, name, palette.FAINT, 11)
