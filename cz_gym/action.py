@@ -114,5 +114,5 @@ def mismatch(made_for: MadeFor | None, own: MadeFor) -> str:
         return ""
     return (
         f"this controller or agent was made for {made_for}; the environment has {own}: "
-        'gym.make("Cz-v0", **controller.settings) makes the one that it was made for'
+        "gym.make(..., **controller.settings) makes the one that it was made for"
     )

@@ -188,8 +188,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)  # small networks are quicker so
     names = given.sets.split(",")
     have = minari.list_local_datasets()
-    if missing := [name for name in names if f"cz/randomized/{name}-v0" not in have]:
-        write_datasets(["--policies", ",".join(missing)])
+    missing = [name for name in names if f"cz/randomized/{name}-v0" not in have]
+    if missing and (code := write_datasets(["--policies", ",".join(missing)])):
+        sys.exit(code)
     rows = [row for name in names for row in compare(name, given.seeds)]
     text = markdown(("dataset", "learner", "score, mean and range over seeds", "crystals lost [%]"), rows)
     print(text)

@@ -112,7 +112,10 @@ def changed(changes: Sequence[str]) -> SAC:
         name, _, value = change.partition("=")
         if name not in numbers:
             raise CzError(f"{change!r} is no FIELD=NUMBER; fields: {', '.join(sorted(numbers))}")
-        given[name] = type(getattr(recipe, name))(float(value))
+        try:
+            given[name] = type(getattr(recipe, name))(float(value))
+        except (ValueError, OverflowError):
+            raise CzError(f"{name}={value!r}: not a number that it can be") from None
     return replace(recipe, **given)
 
 
