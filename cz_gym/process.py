@@ -17,6 +17,7 @@ Another process is one more value, in a room of its own:
   numbers from ``slot.streams`` where it needs some.
 * Numbers that outlive a step, as a running mean of the pull speed: the fields of :attr:`Process.Extra` stand in the
   slot; ``begin`` sets them, ``carry`` moves them on at every step, ``charged`` may charge them.
+* Sensors beside camera and pyrometer: ``sense`` draws their noise into such fields.
 * Constants of an episode: fields of ``Extra`` that ``begin`` draws, or new ones of ``Episode`` and of the scenario.
 * Stages: numbers of the parameters, which ``derive`` hands on as constants.
 * An end with success: ``accept`` returns :data:`DONE`, which ``slot.over`` then is; a row ``succeeded`` of ``info``
@@ -118,6 +119,11 @@ def carry_nothing(extra: Any, u: Any, nominal: Any, interval: Any) -> Any:
     return extra
 
 
+@jittable
+def no_sensors(slot: Any) -> None:
+    """A process that camera and pyrometer alone see."""
+
+
 def no_stages(parameters: Any, machine: Any, stage: Any) -> Any:
     """The parameters of a process without stages; CzError for a stage."""
     if stage is not None:
@@ -204,6 +210,9 @@ class Process(NamedTuple):
     """Numbers of a slot that outlive a step."""
     carry: Function = carry_nothing
     """``carry(extra, u, nominal, interval)``: ``Extra`` after the drives have moved to u, counted from ``nominal``."""
+    sense: Function = no_sensors
+    """``sense(slot)``: writes a sample of sensors of its own into ``Extra``, with random numbers from
+    ``slot.streams``."""
     nominal_moves: bool = False
     """Whether ``nominal`` depends on the state."""
     name: str = ""

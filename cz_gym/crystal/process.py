@@ -11,7 +11,8 @@ from cz_gym.body import cost
 from cz_gym.body.plant import hidden_load
 from cz_gym.body.process import BODY
 from cz_gym.body.task import HEIGHT_MAX_IN_A
-from cz_gym.episodes.record import Episode, Factors
+from cz_gym.episodes.record import Episode, Factors, Stream
+from cz_gym.episodes.rng import normal
 from cz_gym.episodes.scenario import DRAW_SPAN
 from cz_gym.episodes.schedule import bias_offset
 from cz_gym.errors import CzError
@@ -28,6 +29,7 @@ from .shape import growth_rate, shape_at
 
 SLACK = 1.3
 """Time that an episode may last, in multiples of the recipe's [-]."""
+_START = int(Stream.START)
 Floats = npt.NDArray[np.float64]
 
 
@@ -38,6 +40,8 @@ class Extra(NamedTuple):
     """Exponential mean of the pull speed minus the recipe's over :data:`cz_gym.body.cost.PULL_MEMORY` [m/s]."""
     stop: Any
     """Length at which the episode ends with success [m]."""
+    load_cell: Any
+    """Noise of the load cell's last reading [kg]."""
 
 
 @lru_cache(maxsize=64)
@@ -154,7 +158,13 @@ def lean(slot: Any, measured: Any) -> Any:
 @jittable
 def carry(extra: Any, u: Any, nominal: Any, interval: Any) -> Any:
     """The mean pull speed above the recipe's after an interval."""
-    return Extra(cost.moved_mean(extra.v_p_mean, u.v_p - nominal.v_p, interval), extra.stop)
+    return Extra(cost.moved_mean(extra.v_p_mean, u.v_p - nominal.v_p, interval), extra.stop, 0.0 * extra.load_cell)
+
+
+@jittable
+def sense(slot: Any) -> None:
+    """The load cell's noise, from the stream of the episode's start, which nothing else draws from once it runs."""
+    slot.load_cell = signals.LOAD_CELL_NOISE * slot.episode.camera_sd * normal(slot.streams[_START])
 
 
 @jittable
@@ -211,6 +221,7 @@ CRYSTAL = Process(
     weights=cost.WEIGHTS,
     Extra=Extra,
     carry=carry,
+    sense=sense,
     nominal_moves=True,
     name="CzCrystal-v0",
     table=recipe.TABLE,

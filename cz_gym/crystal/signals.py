@@ -33,6 +33,9 @@ _ONE_WAVE = 100.0 * MINUTE
 """Start of the scenario's error that shifts the wave by its whole length [s]."""
 WEIGHT_STEP = 0.01
 """Resolution of the load cell [kg]."""
+LOAD_CELL_NOISE = 0.05 / (0.05 * MM)
+"""Standard deviation of the load cell's white noise, in multiples of the one that the scenario draws for the camera
+[kg/m]: up to 50 g on "randomized"."""
 _T, _R = 10.0, 20.0 * MM
 
 
@@ -44,13 +47,13 @@ def recipe_error(L: Any, e: Any) -> Any:
 
 
 @jittable
-def weight(x: Any, p: Any) -> Any:
-    """What hangs on the load cell [N]: crystal and meniscus, at Hurle's angle, in whole steps of its resolution.
+def weight(x: Any, noise: Any, p: Any) -> Any:
+    """The load cell's reading [N]: crystal and meniscus, at Hurle's angle, and its noise [kg], in whole steps.
 
     A small imaginary part is not rounded.
     """
     h_c = height_inside(x.h_c, p)
-    hangs = x.M_s + meniscus_mass(x.r_c, h_c, hurle_slope(x.r_c, h_c, p)[1], p)
+    hangs = x.M_s + meniscus_mass(x.r_c, h_c, hurle_slope(x.r_c, h_c, p)[1], p) + noise
     return p.g * WEIGHT_STEP * np.rint(hangs.real / WEIGHT_STEP) + p.g * (hangs - hangs.real)
 
 
@@ -85,7 +88,7 @@ class Measured(NamedTuple):
     L: Annotated[Any, Channel("m", 0.2, "length grown since the crown began")]
     v_p_ref: Annotated[Any, Channel("m/s", PULL_SCALE, "the recipe's pull speed minus v_0; the scale is v_0")]
     Q_H_ref: Annotated[Any, Channel("W", HEATER_SCALE, "the recipe's heater power minus nominal")]
-    weight: Annotated[Any, Channel("N", 5.0, "weight of crystal and meniscus minus the recipe's at this length")]
+    weight: Annotated[Any, Channel("N", 5.0, "the load cell's reading minus the recipe's weight at this length")]
 
 
 @jittable
@@ -111,7 +114,7 @@ def measure(x: Any, u: Any, nominal: Any, extra: Any, readings: Any, slot: Any, 
         L=L,
         v_p_ref=nominal.v_p - p.v_0,
         Q_H_ref=nominal.Q_H - p.Q_H_0,
-        weight=weight(x, p) - p.g * (value(L, slot, recipe._M_s) + value(L, slot, recipe._M_men)),
+        weight=weight(x, extra.load_cell, p) - p.g * (value(L, slot, recipe._M_s) + value(L, slot, recipe._M_men)),
     )
 
 
@@ -195,7 +198,7 @@ class Logged(NamedTuple):
     T_1_ref: Annotated[Any, Channel("K", 1.0, "recipe of the heater temperature, as it is given")]
     T_b: Annotated[Any, Channel("K", 1.0, "true melt temperature")]
     M_s: Annotated[Any, Channel("kg", 1.0, "true mass of the crystal, its neck included")]
-    weight: Annotated[Any, Channel("N", 1.0, "weight on the load cell")]
+    weight: Annotated[Any, Channel("N", 1.0, "the load cell's reading, with noise")]
     H: Annotated[Any, Channel("m", 1.0, "depth of the melt in the crucible, which the lift follows")]
     v_over_G: Annotated[Any, Channel("1", 1.0, "v/G, growth rate by temperature gradient, relative to the recipe's")]
     dopant: Annotated[Any, Channel("1", 1.0, "dopant that the crystal takes up, relative to its first part's")]
@@ -256,7 +259,7 @@ def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, at: Any) -> A
         T_1_ref=p.T_1_0 + measured.T_1_ref,
         T_b=x.T_b,
         M_s=x.M_s,
-        weight=weight(x, p),
+        weight=weight(x, slot.load_cell, p),
         H=at.deep * p.H_ref,
         v_over_G=(at.v_g / at.Phi_s) / (now.v_g / Phi_s),
         dopant=x.N / left,

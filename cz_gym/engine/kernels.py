@@ -53,6 +53,7 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, 
     if fresh:
         camera, pyrometer = sample_noise(slot.episode, slot.streams)
         sense(slot, camera, pyrometer, memory.frames[i], t, seen)
+        process.sense(slot)
     u, before, extra = labelled(Inputs, slot), Inputs(slot.v_p_before, slot.Q_H_before), labelled(process.Extra, slot)
     nominal = Inputs(slot.v_p_nominal, slot.Q_H_nominal)
     measured = process.measure(x, u, nominal, extra, labelled(Readings, slot), slot, t)

@@ -2,6 +2,7 @@
 
 import pickle
 import warnings
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +15,7 @@ import cz_gym
 from cz_gym.crystal import signals
 from cz_gym.crystal_env import CzCrystalEnv, CzCrystalVectorEnv
 from cz_gym.episodes.scenario import DRAW_SPAN
+from cz_gym.episodes.scenarios import NOMINAL
 from cz_gym.observation import decode
 from cz_gym.support.units import HOUR, MM
 from tests.vector_checker import check_vector_env
@@ -151,3 +153,16 @@ def test_weight_and_lean_info():
     assert info.keys() == {"r_c", "r_ref", "cost", "succeeded"}
     seen = decode(observation, *env.config.ranges, env.config.process)
     assert abs(seen.weight) <= 0.5 * 9.81 * signals.WEIGHT_STEP + 1e-4
+
+
+def test_the_load_cell_is_as_noisy_as_its_scenario_says():
+    """Two crystals of one scenario that differ in the camera's noise alone: the weights differ by the load cell's."""
+    sensor = replace(NOMINAL.sensor, camera_noise=(0.05 * MM, 0.05 * MM))
+    weights = []
+    for scenario in (NOMINAL, replace(NOMINAL, sensor=sensor)):
+        envs = CzCrystalVectorEnv(200, scenario=scenario, **PLAIN)
+        envs.reset(seed=0)
+        weights.append([envs.step(np.zeros((200, 2), np.float32))[4]["weight"] for _ in range(20)])
+    noise = np.subtract(*weights[::-1]) / 9.81
+    assert np.std(noise) == pytest.approx(0.05, rel=0.03)
+    assert abs(np.corrcoef(noise[1:].ravel(), noise[:-1].ravel())[0, 1]) < 0.04, "white"
