@@ -12,6 +12,7 @@ from pathlib import Path
 from cz_gym.agents.agent_file.contract import AgentFileError, Contract, read_agent
 from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.config import Config
+from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.support.names import unknown
 
 __all__ = ["AgentFileError", "Contract", "OnnxPolicy", "load", "shipped", "shipped_names", "shipped_seeds"]
@@ -24,7 +25,7 @@ def load(name: str | Path = DEFAULT, config: Config | None = None) -> OnnxPolicy
     """A trained agent, ready for ``predict``: a shipped one by its name, or an agent file (.onnx).
 
     With a config, the agent must be made for its plant, observation, actions and control interval; without,
-    ``gym.make("Cz-v0", **agent.settings)`` makes an environment for the agent. AgentFileError says in one line why the
+    ``gym.make(agent.contract.environment, **agent.settings)`` makes an environment for the agent. AgentFileError says in one line why the
     agent cannot be loaded.
     """
     policy = OnnxPolicy.load(name if Path(name).suffix == ".onnx" else shipped(str(name)), config)
@@ -37,16 +38,18 @@ def load(name: str | Path = DEFAULT, config: Config | None = None) -> OnnxPolicy
     return policy
 
 
-def shipped_names() -> list[str]:
-    """Names of the trained agents that come with the package."""
-    return sorted({path.stem.rpartition("-seed")[0] for path in MODELS.glob("*-seed*.onnx")})
+def shipped_names(environment: str = "Cz-v0") -> list[str]:
+    """Names of the trained agents that come with the package for an environment."""
+    names = sorted({path.stem.rpartition("-seed")[0] for path in MODELS.glob("*-seed*.onnx")})
+    return [name for name in names if read_agent(shipped_seeds(name)[0])[0].environment == environment]
 
 
 def shipped_seeds(name: str = DEFAULT) -> list[Path]:
     """Paths of the shipped agents of that name, by training seed; AgentFileError lists the names there are."""
     paths = {int(path.stem.removeprefix(f"{name}-seed")): path for path in MODELS.glob(f"{name}-seed[0-9]*.onnx")}
     if not paths:
-        raise AgentFileError(unknown("shipped agent", name, shipped_names()))
+        known = [each for environment in ENVIRONMENTS for each in shipped_names(environment)]
+        raise AgentFileError(unknown("shipped agent", name, known))
     return [paths[seed] for seed in sorted(paths)]
 
 

@@ -68,9 +68,7 @@ def train(name: str, seed: int) -> list[tuple[Any, ...]]:
         env = VecNormalize(env, norm_obs=learner.normalised)
     module, _, kind = ALGORITHMS[learner.algorithm].partition(":")
     config = make_config("randomized", None, learner.observation)
-    model = getattr(import_module(module), kind)(
-        learner.policy, env, seed=seed, device="cpu", **dict(learner.settings)
-    )
+    model = getattr(import_module(module), kind)(learner.policy, env, seed=seed, device="cpu", **dict(learner.settings))
     rows = list[tuple[Any, ...]]()
     for steps in range(MILLION, learner.steps + 1, MILLION):
         model.learn(MILLION // learner.action_repeat, reset_num_timesteps=False)

@@ -189,7 +189,8 @@ RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in (PPO(), PLAIN, S
 """Recipes by name: the choices of ``train.py --algo``."""
 _along: dict[str, Any] = {"environment": CRYSTAL, "stages": ("crown", "body", "tail"), "scenario": "randomized"}
 CRYSTAL_RECIPES: dict[str, Recipe] = {
-    recipe.name: recipe for recipe in (PPO(**_along), APG(num_envs=96, steps=8_640_000, **_along))
+    "ppo": PPO(name="ppo-along", **_along),
+    "gradient": APG(name="gradient-along", num_envs=96, steps=8_640_000, **_along),
 }
 """Recipes of CzCrystal-v0: one agent for crown, body and tail."""
 DEFAULT = "ppo"

@@ -113,11 +113,6 @@ def registered(arguments: argparse.Namespace) -> tuple[Contender, ...]:
     return registry.CRYSTAL_CONTROLLERS if arguments.env == "CzCrystal-v0" else registry.CONTROLLERS
 
 
-def shipped_agents(arguments: argparse.Namespace) -> list[str]:
-    """The shipped agents of an environment."""
-    return [] if arguments.env == "CzCrystal-v0" else shipped_names()
-
-
 def benchmark(arguments: argparse.Namespace, command: str) -> int:
     """Check the arguments, run the benchmark, write and print the results."""
     rows = rows_of(arguments)
@@ -164,7 +159,7 @@ def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Co
     ``--slow`` asks for them, or if they are named and all their episodes cached.
     """
     own, given = [user_code.controller(place) for place in arguments.controller], given_agents(arguments)
-    controllers, shipped = registered(arguments), shipped_agents(arguments)
+    controllers, shipped = registered(arguments), shipped_names(arguments.env)
     names = [each.name for each in controllers]
     new = [name for name in given if name not in shipped]
     user_code.check_apart([*names, *shipped, *new, *(each.name for each in own)], "controller")
@@ -199,7 +194,7 @@ def given_agents(arguments: argparse.Namespace) -> dict[str, Contender]:
     """Agents of files by name: the files of one name are its training seeds."""
     policies: dict[str, list[OnnxPolicy]] = {}
     for name, file in arguments.agent:
-        if str(file) in shipped_names() and not file.exists():
+        if str(file) in shipped_names(arguments.env) and not file.exists():
             raise CzError(f"--agent takes a file; {file} is shipped and runs by its name: --controllers {file}")
         policy = OnnxPolicy.load(file)
         policies.setdefault(name or policy.contract.algorithm, []).append(policy)
@@ -209,7 +204,7 @@ def given_agents(arguments: argparse.Namespace) -> dict[str, Contender]:
 def is_partial(arguments: argparse.Namespace, contenders: Sequence[Contender], rows: Sequence[Row]) -> bool:
     """Whether the run holds less than the default one, or something of the user's own."""
     usual = {each.name for each in registered(arguments) if each.default and not each.slow}
-    usual |= set(shipped_agents(arguments))
+    usual |= set(shipped_names(arguments.env))
     usual_rows = {row for row in ENVIRONMENTS[arguments.env] if row.default}
     missing = usual - {each.name for each in contenders} or usual_rows - set(rows)
     own = arguments.agent or arguments.controller or arguments.scenario or arguments.puller
