@@ -25,8 +25,8 @@ def load(name: str | Path = DEFAULT, config: Config | None = None) -> OnnxPolicy
     """A trained agent, ready for ``predict``: a shipped one by its name, or an agent file (.onnx).
 
     With a config, the agent must be made for its plant, observation, actions and control interval; without,
-    ``gym.make(agent.contract.environment, **agent.settings)`` makes an environment for the agent. AgentFileError says in one line why the
-    agent cannot be loaded.
+    ``gym.make(agent.contract.environment, **agent.settings)`` makes an environment for the agent. AgentFileError says
+    in one line why the agent cannot be loaded.
     """
     policy = OnnxPolicy.load(name if Path(name).suffix == ".onnx" else shipped(str(name)), config)
     for setting, value in policy.settings.items():

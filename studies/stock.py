@@ -1,4 +1,4 @@
-"""Stock learners on the environment as it comes: ``python -m studies.stock`` trains stable-baselines3's on its defaults.
+"""Stock learners on the environment as it comes: ``python -m studies.stock`` trains those of stable-baselines3.
 
 Each is judged on validation crystals of ``randomized`` after one million steps and after two, with each training seed.
 Runs that ``--out`` holds are not trained again.
