@@ -8,7 +8,7 @@ from cz_gym.baselines.bounds.lqg import full_information, privileged
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.mpc import ekf_mpc
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
-from cz_gym.baselines.tuning.crystal import CRYSTALS, RING_PID, TRUE_PID
+from cz_gym.baselines.tuning.crystal import CRYSTALS, RING_PID, TRUE_PID, in_proportion
 from cz_gym.baselines.tuning.lqg import BEST_RETURN, FILTER, LQGS, TunedLQG, adaptive
 from cz_gym.baselines.tuning.pid import PIDS, paper_here
 from cz_gym.body.process import BODY
@@ -100,11 +100,11 @@ CONTROLLERS: tuple[Contender, ...] = (
 """Every named controller of ``Cz-v0``, in the order of tables."""
 CRYSTAL_CONTROLLERS: tuple[Contender, ...] = (
     Contender("recipe", partial(unchanged, OpenLoop()), "measured", "the recipe's pull speed and power, no feedback"),
-    Contender("ring-pid", RING_PID.for_config, "measured", "PID on the bright ring with the body's gains"),
+    Contender("ring-pid", partial(in_proportion, RING_PID), "measured", "PID on the bright ring with the body's gains"),
     *(each.contender for each in CRYSTALS),
     Contender(
         "true-radius",
-        TRUE_PID.for_config,
+        partial(in_proportion, TRUE_PID),
         "state",
         "bound: the PID on the true radius, which no sensor shows",
         privileged=True,

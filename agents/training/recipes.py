@@ -187,7 +187,11 @@ PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64))
 """stable-baselines3's own PPO, told nothing: beside ``ppo`` it shows what the true state is worth in training."""
 RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG())}
 """Recipes by name: the choices of ``train.py --algo``."""
-_along: dict[str, Any] = {"environment": CRYSTAL, "stages": ("crown", "body", "tail"), "scenario": "randomized=0.5,hard=0.5"}
+_along: dict[str, Any] = {
+    "environment": CRYSTAL,
+    "stages": ("crown", "body", "tail"),
+    "scenario": "randomized=0.5,hard=0.5",
+}
 CRYSTAL_RECIPES: dict[str, Recipe] = {
     "ppo": PPO(name="ppo-along", **_along),
     "gradient": APG(name="gradient-along", num_envs=96, steps=17_280_000, **_along),

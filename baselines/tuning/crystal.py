@@ -5,7 +5,7 @@ the ring misleads most.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,9 +19,11 @@ from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.evaluation.contender import Contender
 from cz_gym.evaluation.crystal_metrics import Floats, crystal_metrics
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.process import HEATER_SCALE, PULL_SCALE
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from .record import Goal, Parameter
+from .scaling import scaled
 from .values import by_scenario, with_values
 
 STAGES = {"crown": 0.6, "body": 0.2, "tail": 0.2}
@@ -97,6 +99,17 @@ def priced(figures: CrystalFigures) -> float:
     return figures.crown_mm + 0.5 * figures.tail_mm + rest + FAILURE_PRICE * figures.failure_rate
 
 
+def in_proportion(settings: Any, config: Config) -> Any:
+    """The settings for the default puller, in proportion to the puller of an environment."""
+    if isinstance(settings, CrystalPID):
+        return scaled(settings, config)
+    own, given = config.ranges, settings.weights
+    pull, power = own[0] / PULL_SCALE, own[1] / HEATER_SCALE
+    sizes = {"pull": pull, "pull_step": pull, "power": power, "power_step": power}
+    weights = given._replace(**{name: factor * getattr(given, name) for name, factor in sizes.items()})
+    return replace(settings, weights=weights).for_config(config)
+
+
 @dataclass(frozen=True, kw_only=True)
 class TunedCrystal:
     """A tuned controller of whole crystals: its start, the numbers that were searched, its row in tables."""
@@ -116,8 +129,7 @@ class TunedCrystal:
     def make(self, config: Config) -> CrystalPID | CrystalLQG:
         """The controller for an environment, with the settings that were chosen."""
         chosen = by_scenario(self.name).get(RANDOMIZED.name, {})
-        settings: CrystalPID | CrystalLQG = with_values(self.start, chosen)
-        return settings.for_config(config)
+        return in_proportion(with_values(self.start, chosen), config)
 
     @property
     def contender(self) -> Contender:

@@ -11,7 +11,9 @@ from cz_gym.baselines.pid.industrial import Industrial
 from cz_gym.body.linearisation import RadiusModel, radius_model
 from cz_gym.body.plant import make_puller
 from cz_gym.config import Config
+from cz_gym.jit.compile import labelled
 from cz_gym.machine.puller import DEFAULT
+from cz_gym.physics.parameters import Parameters
 from cz_gym.support.units import MM
 
 from .values import with_values
@@ -37,7 +39,7 @@ def factors(config: Config) -> dict[str, float]:
     capacity; the melt temperature that changes growth by v_0.
     """
     default, own = radius_model(make_puller()), model_of(config)
-    time, pullers = default.zero / own.zero, map(make_puller, (config.parameters, DEFAULT.parameters))
+    time, pullers = default.zero / own.zero, [make_puller(each) for each in (_of(config), DEFAULT.parameters)]
     trims = [p.v_0 * p.rho_dH * p.h_0 / p.k_l for p in pullers]
     gains = [design_compensator(model, CUT_OFF / slower).gain for model, slower in ((own, time), (default, 1.0))]
     return {
@@ -53,7 +55,12 @@ def factors(config: Config) -> dict[str, float]:
 
 def model_of(config: Config) -> RadiusModel:
     """Model I of an environment's puller."""
-    return radius_model(make_puller(config.parameters, 1.0, config.meniscus))
+    return radius_model(make_puller(_of(config), 1.0, config.meniscus))
+
+
+def _of(config: Config) -> Parameters:
+    """The puller's own parameters, also where a whole crystal is grown."""
+    return labelled(Parameters, config.parameters)
 
 
 def scaled(settings: Any, config: Config) -> Any:
