@@ -5,6 +5,8 @@ import pytest
 
 from cz_gym.baselines.crystal.lqg import STATES, Noise, Weights, design
 from cz_gym.baselines.registry import CRYSTAL_CONTROLLERS, make_controller
+from cz_gym.baselines.tuning.crystal import CRYSTALS
+from cz_gym.baselines.tuning.values import by_scenario, with_values
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.errors import CzError
@@ -42,6 +44,25 @@ def test_the_ring_freezes_a_pid_with_the_body_s_gains():
     found = crystal_metrics(rollout(contender.make(CROWN.config("measured")), CROWN.config("measured"), range(12)))
     assert found.frozen.all()
     assert found.lost_in_crown.all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "least"), [("compensated", 4), ("true-radius", 6)])
+def test_crowns_of_another_puller_with_settings_in_proportion(name, least):
+    """With the default puller's own settings ``compensated`` loses all."""
+    (contender,) = (each for each in CRYSTAL_CONTROLLERS if each.name == name)
+    config = make_config(
+        "randomized", observation=contender.observation, action="direct", process=CRYSTAL, puller="germanium"
+    )
+    found = crystal_metrics(rollout(contender.make(config), config, TRAINING_SEEDS[:6]))
+    assert found.completed.sum() >= least
+
+
+def test_settings_in_proportion_are_the_settings_for_the_default_puller():
+    config = make_config("randomized", observation="measured", action="direct", process=CRYSTAL)
+    for each in CRYSTALS:
+        chosen = with_values(each.start, by_scenario(each.name)["randomized"])
+        assert each.make(config) == chosen.for_config(config)
 
 
 def test_filter_and_regulator_are_stable_at_every_length():
