@@ -111,15 +111,43 @@ def test_pins_lie_in_the_open_ranges(file):
         assert {requirement.name for requirement in requirements} == set(pins)
 
 
-def test_the_lock_holds_the_pinned_versions_with_hashes():
-    locked = tomllib.loads((ROOT / "pylock.toml").read_text())["packages"]
+@pytest.mark.parametrize("extra", ["benchmark", "docs", "test"])
+def test_the_lock_holds_the_pinned_versions_with_hashes(extra):
+    locked = tomllib.loads((ROOT / f"pylock.{extra}.toml").read_text())["packages"]
     lines = (line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines()[1:])
     pins = {plain(name): version for name, version in lines}
     assert {each["name"]: each["version"] for each in locked if each["name"] in pins}.items() <= pins.items()
     files = [file for each in locked for file in (*each.get("wheels", ()), *filter(None, [each.get("sdist")]))]
     assert all(file["hashes"]["sha256"] for file in files)
     needed = {plain(re.match(r"[\w.-]+", text)[0]) for text in PROJECT["dependencies"]}
-    assert {*needed, "torch", "distributed"} <= {each["name"] for each in locked}
+    names = {each["name"] for each in locked}
+    assert needed <= names
+    assert "torch" not in names, "pip's settings say which build of it to take"
+
+
+LOCKED = """lock-version = "1.0"
+created-by = "test"
+[[packages]]
+name = "nowhere"
+version = "1.0"
+wheels = [{{ path = "{wheel}", hashes = {{ sha256 = "{hash}" }} }}]
+"""
+
+
+@pytest.mark.parametrize(("tag", "code", "said"), [("any", 2, "Hash mismatch"), ("win32", 0, "by constraints")])
+def test_make_stops_at_another_hash_and_goes_on_without_a_lock_for_this_machine(tag, code, said, tmp_path):
+    pytest.importorskip("uv")
+    wheel = tmp_path / f"nowhere-1.0-py3-none-{tag}.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        archive.writestr("nowhere-1.0.dist-info/METADATA", "Metadata-Version: 2.1\nName: nowhere\nVersion: 1.0\n")
+    (tmp_path / "pylock.benchmark.toml").write_text(LOCKED.format(wheel=wheel.name, hash="0" * 64))
+    (tmp_path / ".venv").mkdir()
+    for name in ("pyproject.toml", "constraints.txt"):
+        (tmp_path / name).touch()
+    line = ["make", "-s", "-f", ROOT / "Makefile", f"BIN={Path(sys.executable).parent}", "install=true"]
+    done = subprocess.run([*line, ".venv/.ready-benchmark"], cwd=tmp_path, capture_output=True, text=True)
+    assert said in done.stdout + done.stderr
+    assert done.returncode == code
 
 
 def test_actions_are_pinned_by_hash():
