@@ -88,18 +88,24 @@ def test_versions_agree_and_core_dependencies_are_four():
     assert names == ["gymnasium", "numpy", "scipy", "numba"]
 
 
+def required(extra):
+    """Requirements of the project with an extra, on Python 3.11."""
+    parse = pytest.importorskip("packaging.requirements").Requirement
+    extras = PROJECT["optional-dependencies"]
+    every = [*map(parse, [*PROJECT["dependencies"], *extras[extra]])]
+    for own in [each for each in every if each.name == PROJECT["name"]]:
+        every.remove(own)
+        every += [parse(text) for name in own.extras for text in extras[name]]
+    return [each for each in every if not each.marker or each.marker.evaluate({"python_version": "3.11"})]
+
+
 @pytest.mark.parametrize("file", ["constraints.txt", "constraints-lowest.txt"])
 def test_pins_lie_in_the_open_ranges(file):
     """And ``make test-lowest`` tests the lowest versions of all it names; torch alone stands where its note says."""
-    packaging = pytest.importorskip("packaging.requirements")
     version = pytest.importorskip("packaging.version").Version
     lines = [line for line in (ROOT / file).read_text().splitlines() if not line.startswith("#")]
     pins = {name.lower().replace("_", "-"): pin for name, pin in (line.split("==") for line in lines)}
-    extras = PROJECT["optional-dependencies"]
-    chosen = [*PROJECT["dependencies"], *extras["test"][1:]]
-    chosen += [text for name in packaging.Requirement(extras["test"][0]).extras for text in extras[name]]
-    every = map(packaging.Requirement, chosen)
-    requirements = [each for each in every if not each.marker or each.marker.evaluate({"python_version": "3.11"})]
+    requirements = required("test")
     for requirement in requirements:
         (bound,) = (each for each in requirement.specifier if each.operator != "<")
         pin, least = pins[requirement.name.lower()], version(bound.version).release
@@ -119,9 +125,8 @@ def test_the_lock_holds_the_pinned_versions_with_hashes(extra):
     assert {each["name"]: each["version"] for each in locked if each["name"] in pins}.items() <= pins.items()
     files = [file for each in locked for file in (*each.get("wheels", ()), *filter(None, [each.get("sdist")]))]
     assert all(file["hashes"]["sha256"] for file in files)
-    needed = {plain(re.match(r"[\w.-]+", text)[0]) for text in PROJECT["dependencies"]}
     names = {each["name"] for each in locked}
-    assert needed <= names
+    assert {plain(each.name) for each in required(extra)} - names <= {"torch"}
     assert "torch" not in names, "pip's settings say which build of it to take"
 
 
