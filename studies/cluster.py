@@ -9,6 +9,7 @@ import pickle
 import sys
 import time
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -51,9 +52,8 @@ def _warm(tasks: Sequence[Task]) -> None:
 
 def on_workers(number: int, cache: Path) -> tuple[float, float, list[Any]]:
     """Times of an empty task and of all tasks on that many workers [s], and the results."""
-    from distributed import LocalCluster
-
-    with LocalCluster(n_workers=number, threads_per_worker=1, dashboard_address=None) as cluster:
+    start = import_module("distributed").LocalCluster
+    with start(n_workers=number, threads_per_worker=1, dashboard_address=None) as cluster:
         address = cluster.scheduler_address
         cluster.get_client().run(_warm, tasks_of(WARM, cache))
         empty, one = timed(address, abs, range(EMPTY))[0], timed(address, abs, range(1))[0]
