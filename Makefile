@@ -5,8 +5,13 @@ BIN := $(VENV)/bin
 # Without --no-compile half of an installation's time would go into bytecode that nothing here runs.
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 # uv needs a third of pip's time, and both processors. It does not read pip's settings: pip where uv reaches no index.
-UV := $(BIN)/python -m uv pip install --quiet --python $(BIN)/python --constraint constraints.txt
-install = $(UV) --editable $(1) || $(PIP) --editable $(1)
+UV := $(BIN)/python -m uv pip install --quiet --python $(BIN)/python
+# First the locked files, each with its hash; a file with another hash stops all. Where a lock has none for this machine
+# (Linux on x86-64 and Python 3.11), or no index is reached, the versions of constraints.txt come without hashes.
+locked = said=$$($(UV) --require-hashes --only-binary :all: --requirements pylock.$(1).toml 2>&1) || \
+	case $$said in *"Hash mismatch"*) echo "$$said" >&2; exit 1;; \
+	*) echo "make: by constraints.txt, not by pylock.$(1).toml: $$(echo "$$said" | tail -n 1)";; esac
+install = $(UV) --constraint constraints.txt --editable ".[$(1)]" || $(PIP) --editable ".[$(1)]"
 TEST_READY := $(VENV)/.ready-test
 BENCHMARK_READY := $(VENV)/.ready-benchmark
 DOCS_READY := $(VENV)/.ready-docs
@@ -75,9 +80,11 @@ audit: ## known weaknesses of the pinned and of the lowest packages; asks PyPI's
 	for pins in constraints.txt constraints-lowest.txt; do \
 	build/audit/bin/pip-audit --requirement $$pins --no-deps --disable-pip --strict || exit 1; done
 
-lock: $(TEST_READY) ## pylock.toml: the pinned versions for Linux with their hashes; asks PyPI
-	$(BIN)/uv pip compile pyproject.toml --extra test --constraint constraints.txt --python-platform linux --quiet \
-	--generate-hashes --no-header --format pylock.toml --output-file pylock.toml
+# torch and what it alone needs stay out: pip's settings say which build of it to take.
+lock: $(TEST_READY) ## pylock.*.toml: the pinned versions for Linux with their hashes; asks PyPI
+	for extra in benchmark docs test; do echo torch | $(BIN)/uv pip compile pyproject.toml --extra $$extra \
+	--constraint constraints.txt --excludes - --python-platform linux --quiet --generate-hashes --no-header \
+	--format pylock.toml --output-file pylock.$$extra.toml || exit 1; done
 
 test-browser: $(BROWSER_READY) ## report.html in Chromium without a window; skipped where chromium or chromedriver is absent
 	$(BIN)/python -m pytest -q tests/browser
@@ -108,20 +115,18 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) uv
 
-$(BENCHMARK_READY): pyproject.toml constraints.txt | $(BIN)/python
-	$(call install,".[benchmark]")
+$(BENCHMARK_READY) $(DOCS_READY): $(VENV)/.ready-%: pyproject.toml constraints.txt pylock.%.toml | $(BIN)/python
+	$(call locked,$*)
+	$(call install,$*)
 	touch $@
 
-$(DOCS_READY): pyproject.toml constraints.txt | $(BIN)/python
-	$(call install,".[docs]")
-	touch $@
-
-# torch first and by pip, whose settings say which build to take.
-$(TEST_READY): pyproject.toml constraints.txt | $(BIN)/python
+# torch by pip, before uv would take another build.
+$(TEST_READY): pyproject.toml constraints.txt pylock.test.toml | $(BIN)/python
+	$(call locked,test)
 	$(PIP) torch
-	$(call install,".[test]")
+	$(call install,test)
 	touch $(BENCHMARK_READY) $(DOCS_READY) $@
 
 $(BROWSER_READY): $(TEST_READY)
-	$(call install,".[browser]")
+	$(call install,browser)
 	touch $@

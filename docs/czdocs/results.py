@@ -142,6 +142,7 @@ TABLES: dict[str, Callable[[], Lines]] = {
     "figures-lqg": partial(figures, "benchmark", LQGS),
     "figures-bounds": partial(figures, "bounds", BOUNDS, SCENARIOS[:-1]),
     "figures-mpc": partial(figures, "bounds", ("lqg", "lqg-quiet", "ekf-mpc"), SCENARIOS[:-1]),
+    "cluster": partial(copied, "cluster/table.md"),
     "critic": partial(copied, "critic/table.md"),
     "faults": faults,
     "gaps": gaps,

@@ -1,6 +1,7 @@
 """Installation: one package with four dependencies, by every way of installing it."""
 
 import importlib
+import json
 import os
 import re
 import shutil
@@ -88,18 +89,24 @@ def test_versions_agree_and_core_dependencies_are_four():
     assert names == ["gymnasium", "numpy", "scipy", "numba"]
 
 
+def required(extra):
+    """Requirements of the project with an extra, on Python 3.11."""
+    parse = pytest.importorskip("packaging.requirements").Requirement
+    extras = PROJECT["optional-dependencies"]
+    every = [*map(parse, [*PROJECT["dependencies"], *extras[extra]])]
+    for own in [each for each in every if each.name == PROJECT["name"]]:
+        every.remove(own)
+        every += [parse(text) for name in own.extras for text in extras[name]]
+    return [each for each in every if not each.marker or each.marker.evaluate({"python_version": "3.11"})]
+
+
 @pytest.mark.parametrize("file", ["constraints.txt", "constraints-lowest.txt"])
 def test_pins_lie_in_the_open_ranges(file):
     """And ``make test-lowest`` tests the lowest versions of all it names; torch alone stands where its note says."""
-    packaging = pytest.importorskip("packaging.requirements")
     version = pytest.importorskip("packaging.version").Version
     lines = [line for line in (ROOT / file).read_text().splitlines() if not line.startswith("#")]
     pins = {name.lower().replace("_", "-"): pin for name, pin in (line.split("==") for line in lines)}
-    extras = PROJECT["optional-dependencies"]
-    chosen = [*PROJECT["dependencies"], *extras["test"][1:]]
-    chosen += [text for name in packaging.Requirement(extras["test"][0]).extras for text in extras[name]]
-    every = map(packaging.Requirement, chosen)
-    requirements = [each for each in every if not each.marker or each.marker.evaluate({"python_version": "3.11"})]
+    requirements = required("test")
     for requirement in requirements:
         (bound,) = (each for each in requirement.specifier if each.operator != "<")
         pin, least = pins[requirement.name.lower()], version(bound.version).release
@@ -111,21 +118,62 @@ def test_pins_lie_in_the_open_ranges(file):
         assert {requirement.name for requirement in requirements} == set(pins)
 
 
-def test_the_lock_holds_the_pinned_versions_with_hashes():
-    locked = tomllib.loads((ROOT / "pylock.toml").read_text())["packages"]
+@pytest.mark.parametrize("extra", ["benchmark", "docs", "test"])
+def test_the_lock_holds_the_pinned_versions_with_hashes(extra):
+    locked = tomllib.loads((ROOT / f"pylock.{extra}.toml").read_text())["packages"]
     lines = (line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines()[1:])
     pins = {plain(name): version for name, version in lines}
     assert {each["name"]: each["version"] for each in locked if each["name"] in pins}.items() <= pins.items()
     files = [file for each in locked for file in (*each.get("wheels", ()), *filter(None, [each.get("sdist")]))]
     assert all(file["hashes"]["sha256"] for file in files)
-    needed = {plain(re.match(r"[\w.-]+", text)[0]) for text in PROJECT["dependencies"]}
-    assert {*needed, "torch", "distributed"} <= {each["name"] for each in locked}
+    names = {each["name"] for each in locked}
+    assert {plain(each.name) for each in required(extra)} - names <= {"torch"}
+    assert "torch" not in names, "pip's settings say which build of it to take"
+
+
+LOCKED = """lock-version = "1.0"
+created-by = "test"
+[[packages]]
+name = "nowhere"
+version = "1.0"
+wheels = [{{ path = "{wheel}", hashes = {{ sha256 = "{hash}" }} }}]
+"""
+
+
+@pytest.mark.parametrize(("tag", "code", "said"), [("any", 2, "Hash mismatch"), ("win32", 0, "by constraints")])
+def test_make_stops_at_another_hash_and_goes_on_without_a_lock_for_this_machine(tag, code, said, tmp_path):
+    pytest.importorskip("uv")
+    wheel = tmp_path / f"nowhere-1.0-py3-none-{tag}.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        archive.writestr("nowhere-1.0.dist-info/METADATA", "Metadata-Version: 2.1\nName: nowhere\nVersion: 1.0\n")
+    (tmp_path / "pylock.benchmark.toml").write_text(LOCKED.format(wheel=wheel.name, hash="0" * 64))
+    (tmp_path / ".venv").mkdir()
+    for name in ("pyproject.toml", "constraints.txt"):
+        (tmp_path / name).touch()
+    line = ["make", "-s", "-f", ROOT / "Makefile", f"BIN={Path(sys.executable).parent}", "install=true"]
+    done = subprocess.run([*line, ".venv/.ready-benchmark"], cwd=tmp_path, capture_output=True, text=True)
+    assert said in done.stdout + done.stderr
+    assert done.returncode == code
 
 
 def test_actions_are_pinned_by_hash():
     uses = re.findall(r"uses: (\S+)", "".join(file.read_text() for file in (ROOT / ".github").rglob("*.yml")))
     assert len(uses) > 5
     assert all(re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", each) for each in uses)
+
+
+def test_the_dev_container_installs_what_there_is():
+    """No engine runs it here: what it names exists, and its Python is the one that versions are locked for."""
+    found = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text())
+    assert found["image"].endswith(f"/python:{SETTINGS['tool']['mypy']['python_version']}")
+    command, target = found["postCreateCommand"].split()
+    makefile = (ROOT / "Makefile").read_text()
+    assert command == "make"
+    assert re.search(rf"^{target}:", makefile, re.MULTILINE)
+    folder = re.search(r"^VENV := (\S+)", makefile, re.MULTILINE)[1]
+    assert found["customizations"]["vscode"]["settings"] == {"python.defaultInterpreterPath": f"{folder}/bin/python"}
+    workflow = (ROOT / ".github" / "workflows" / "tests.yml").read_text()
+    assert all(f"{name}: {value}\n" in workflow for name, value in found["containerEnv"].items())
 
 
 def test_environment_and_baselines_need_neither_torch_nor_plots():
