@@ -125,7 +125,8 @@ class Readings(NamedTuple):
     """The readings of a sample and what is known of them."""
 
     read: Measured
-    """With the last good one in place of each bad one; from the nominal values as set."""
+    """With the last good one in place of each bad one, ring and drives on their way from the call before; from the
+    nominal values as set."""
     T_1: Any
     """The pyrometer's, infinite if it is bad [K]."""
     plausible: Measured
@@ -156,6 +157,9 @@ def sample_of(facts: Facts, call: Call, manual: Any, given: Any, memory: Memory)
     trusted = Measured(*(np.where(each, value, np.inf) for each, value in zip(good, seen, strict=True)))
     read = readable(trusted._replace(valid=np.where(ring, 1.0, 0.0)), last)
     read = read._replace(T_1=np.where(pyrometer, seen.T_1, np.where(call.starts, 0.0, expected)))
+    moving = {name: (getattr(last, name), getattr(read, name)) for name in ("ring_error", "v_p", "Q_H")}
+    share = np.where(manual, 1.0, call.share)
+    read = read._replace(**{name: old + share * (new - old) for name, (old, new) in moving.items()})
     mean = np.where(call.starts, read.v_p, moved_mean(last.v_p_mean, read.v_p, facts.dt))
     read = read._replace(v_p_mean=mean)
     shown = np.where(finite(seen.T_1), seen.T_1, np.inf)

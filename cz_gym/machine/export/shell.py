@@ -87,11 +87,8 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
     off_Q_H = np.where(runs, memory.off_Q_H, _beyond(seen.read.Q_H, TRIM_Q_H * facts.ranges[1]))
     read = trimmed(seen.read, off_T_1, off_Q_H)
     nominal = drives[0].nominal, drives[1].nominal + off_Q_H / KILO
-    between = memory.readings.ring_error + call.share * (read.ring_error - memory.readings.ring_error)
-    read = read._replace(ring_error=np.where(runs & call.again, between, read.ring_error))
     estimates = controller.accepts_missing_temperature
-    shown = np.where(call.again, np.inf, seen.T_1 - off_T_1)
-    told = read._replace(T_1=shown, valid=np.where(call.again, 0.0, read.valid)) if estimates else read
+    told = read._replace(T_1=np.where(call.again, np.inf, seen.T_1 - off_T_1)) if estimates else read
     held = memory.controller if runs.all() else select(runs, memory.controller, controller.at_rest(read))
     own = controller.step(told, held)
     other = own[0], own[1], memory.pid
@@ -132,7 +129,7 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
         engaged=np.where(engaged, 1.0, 0.0), since=since, bad=bad,
         fallback=np.where(fallback | (engaged & ~sound), 1.0, 0.0), pull=setpoints[0], heater=setpoints[1],
         astray=astray, shown=seen.shown, still=seen.still, dark=dark, level=level, calm=calm, off_T_1=off_T_1,
-        off_Q_H=off_Q_H, readings=seen.read._replace(ring_error=read.ring_error), controller=own[2], pid=other[2],
+        off_Q_H=off_Q_H, readings=seen.read, controller=own[2], pid=other[2],
     )  # fmt: skip
     return outputs, now, call.due, call.again
 

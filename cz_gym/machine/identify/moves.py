@@ -1,9 +1,10 @@
 """Excitation of a log: the moves of a drive that answer no reading.
 
 A controller's moves are a function of its readings, which a drive's slew rate and range cut off. A linear law is fitted
-to the moves; where a limit cut a move, the law need only ask for as much or more. The law then runs freely over a
-window, on the readings alone, and what the drive has done besides counts: a slow drive that has ramped for a minute has
-moved by a minute's ramp, whatever a row of its log shows.
+to the moves; where a limit cut a move, the law need only ask for as much or more. What the drive has done besides in a
+window counts, by the larger of two measures. Run freely over the window, on the readings alone, the law does not know
+that a slow drive has begun to ramp. Asked for one move at a time, it does not know a step before the readings show it:
+where the pyrometer shows the power in seconds, the law that runs freely follows the power through its effect.
 """
 
 from collections.abc import Sequence
@@ -48,11 +49,15 @@ class Law(NamedTuple):
         """The least and largest move from where the drive is."""
         return np.maximum(-self.slew, self.lowest - before), np.minimum(self.slew, self.highest - before)
 
+    @property
+    def own(self) -> Floats:
+        """Weights of the drive's last values and means."""
+        return self.weights[-1 - PAST - len(MEANS) : -1]
+
     def run(self, asked: Floats, past: Floats, means: Floats) -> Floats:
         """Where the drive is after a window; ``asked``: what the readings ask for, shape (windows, rows)."""
-        own = self.weights[-1 - PAST - len(MEANS) : -1]
         for each in asked.T:
-            now = past[:, 0] + np.clip(each + np.hstack([past, means]) @ own, *self.room(past[:, 0]))
+            now = past[:, 0] + np.clip(each + np.hstack([past, means]) @ self.own, *self.room(past[:, 0]))
             past, means = np.column_stack([now, past[:, :-1]]), self.keep * means + (1.0 - self.keep) * now[:, None]
         last: Floats = past[:, 0]
         return last
@@ -76,25 +81,27 @@ def _unexplained(drive: Floats, readings: Floats, log: Log) -> Floats:
     """Moves in windows that no reading explains, in shares of nominal; none if the law explains nearly all."""
     at = np.flatnonzero(np.diff(drive)) + 1
     pace = int(np.median(np.diff(at))) if len(at) > 1 else 1
-    step, readings, drive = pace * log.interval, readings[::pace], drive[::pace]
+    step, readings, drive = pace * log.interval, readings[::pace], drive[::pace] - drive[::pace].mean()
     rows, per = np.arange(PAST, len(drive)), max(2, round(WINDOW / step))
-    if len(rows) < 20 * (PAST + len(MEANS)):
+    if len(rows) < 10 * (PAST + len(MEANS)):
         return np.zeros(0)
     known = np.where(np.isnan(readings), np.nanmedian(readings, axis=0), readings)
     keep = np.exp(-step / np.array(MEANS))
-    seen, own = _past(known - known.mean(axis=0), keep, rows), _past(drive[:, None] - drive.mean(), keep, rows)
+    seen, own = _past(known - known.mean(axis=0), keep, rows), _past(drive[:, None], keep, rows)
     lost = np.isnan(readings).any(axis=1) | np.isin(np.arange(len(drive)), np.flatnonzero(log.gap) // pace)
     whole = lfilter(np.ones(max(PAST, per)), [1.0], lost)[rows - 1] < 0.5
     whole |= whole.mean() < 0.5
-    law = _fit(np.hstack([seen, own]), np.diff(drive)[rows - 1], drive - drive.mean(), whole, keep)
+    law = _fit(np.hstack([seen, own]), moves := np.diff(drive)[rows - 1], drive, whole, keep)
     windows = np.arange(len(rows) // per * per).reshape(-1, per)
     count, sound = len(windows), windows[whole[windows].all(axis=1)]
     windows = sound if len(sound) else windows
     first, last = windows[:, 0], rows[windows[:, -1]]
-    asked = (seen @ law.weights[: seen.shape[1]] + law.weights[-1])[windows]
-    left = drive[last] - drive.mean() - law.run(asked, own[first, :PAST], own[first, PAST:])
+    asked = seen @ law.weights[: seen.shape[1]] + law.weights[-1]
+    free = drive[last] - law.run(asked[windows], own[first, :PAST], own[first, PAST:])
+    single = (moves - np.clip(asked + own @ law.own, *law.room(own[:, 0])))[windows].sum(axis=1)
     usual = drive[last] - drive[rows[first] - 1]
-    left, usual = (np.sort(np.abs(each))[: int((1.0 - FEW) * len(each))] for each in (left, usual))
+    *ways, usual = (np.sort(np.abs(each))[: int((1.0 - FEW) * len(each))] for each in (free, single, usual))
+    left = max(ways, key=np.linalg.norm)
     moved: Floats = np.sqrt(count / len(windows)) * left[left > MOVE]  # those left out moved as much
     return moved if np.linalg.norm(left) > SHARE * np.linalg.norm(usual) else np.zeros(0)
 

@@ -371,6 +371,29 @@ def test_a_takeover_moves_no_drive_and_authority_grows(name):
     assert Alarm.TAKEOVER not in alarms[-1]
 
 
+def test_the_samples_of_a_late_call_see_ring_and_drives_on_their_way():
+    """Without a ring in them an LQG's search for the rotation takes the rhythm of the calls for a ripple."""
+    block, told = block_of("lqg"), []
+
+    class Spy:
+        accepts_missing_temperature, at_rest = True, block.controller.at_rest
+
+        def step(self, seen, memory):
+            told.append([float(value[0]) for value in (seen.ring_error, seen.v_p, seen.Q_H, seen.T_1, seen.valid)])
+            return block.controller.step(seen, memory)
+
+    watched, rest = replace(block, controller=Spy()), nominal()
+    memory = watched.start(1)
+    for time, late in ((0.0, 0.0), (5.0, 0.0), (10.0, 0.0), (25.0, 1.0)):
+        moved = {"ring_radius_mm": 0.3 * late, "pull_speed_mm_per_min": 0.06 * late, "heater_power_kW": 0.3 * late}
+        given = {name: rest[name] + value for name, value in moved.items()} | {"time_s": time, "ring_time_s": time}
+        _, memory = watched.run(rest | given, memory)
+    thirds = np.array([1.0, 2.0, 3.0])
+    assert np.array(told[-3:])[:, :3] == pytest.approx(np.outer(thirds, [1e-4, 0.02 / 6e4, 100.0]), abs=1e-9)
+    assert np.isfinite(told)[-3:, 3].tolist() == [False, False, True]
+    assert all(each[4] == 1.0 for each in told)
+
+
 def test_a_bad_ring_is_held_then_the_pid_takes_over_until_the_next_takeover():
     plant = Plant("lqg")
     for _ in range(20):

@@ -24,6 +24,7 @@ from cz_gym.machine.identify.verdict import coloured, misfits
 from cz_gym.machine.puller import DEFAULT, find_puller
 from cz_gym.observation import MEASURED, decode
 from cz_gym.support.units import MM
+from studies.identify import draw, write_logs
 from studies.other_machine import SLOW
 from tests.foreign_puller import ForeignPuller, Operator, drive, write_log
 from tests.machine.identify.conftest import OWN, TRUTH
@@ -78,6 +79,22 @@ def test_slow_drives_count_and_a_limit_does_not(tmp_path):
             assert not limits or min(cut) > 0.4
             start = replace(DEFAULT, parameters=DEFAULT.parameters._replace(v_0=puller.z.v_0))
             assert (np.array(measure_excitation([log], start)) >= 1.0).all() == (moves > 0.0)
+
+
+def test_excitation_counts_where_the_pyrometer_shows_the_heater_at_once(tmp_path):
+    """A law that sees the heater's effect in seconds follows its steps, though no reading asked for them."""
+    start, truth = draw(6)
+    excited, passive = (measure_excitation([read_log(log)], start) for log in write_logs(truth, 6, tmp_path))
+    assert min(excited) > 5.0
+    assert max(passive) < 0.5
+
+
+def test_steps_of_a_heater_that_no_controller_moves_count(tmp_path):
+    env = CzEnv(OWN, 0.5, "measured", parameters=TRUTH, action="direct", info="all")
+    pid = make_controller("pid-conventional", env.config)
+    by_hand = replace(pid, heater=replace(pid.heater, K=1e-9))
+    record_log(env, Excited(by_hand, heater=0.01), tmp_path / "log.csv", seed=3)
+    assert min(measure_excitation([read_log(tmp_path / "log.csv")])) > 5.0
 
 
 @pytest.mark.slow
