@@ -62,6 +62,8 @@ DESIGN = (
     Parameter("weights.height", 0.03 * MM, 3.0 * MM),
     Parameter("weights.cones", 0.1, 3.0),
     Parameter("weights.pull", 0.01 * MM_PER_MIN, 3.0 * MM_PER_MIN),
+    Parameter("weights.power", 0.3 * KILO, 30.0 * KILO),
+    Parameter("weights.power_step", 0.1 * KILO, 10.0 * KILO),
 )
 
 
