@@ -131,7 +131,8 @@ class TunedCrystal:
     def make(self, config: Config) -> CrystalPID | CrystalLQG:
         """The controller for an environment, with the settings that were chosen."""
         chosen = by_scenario(self.name).get(RANDOMIZED.name, {})
-        return in_proportion(with_values(self.start, chosen), config)
+        settings: CrystalPID | CrystalLQG = in_proportion(with_values(self.start, chosen), config)
+        return settings
 
     @property
     def contender(self) -> Contender:

@@ -60,7 +60,8 @@ def model_of(config: Config) -> RadiusModel:
 
 def _of(config: Config) -> Parameters:
     """The puller's own parameters, also where a whole crystal is grown."""
-    return labelled(Parameters, config.parameters)
+    own: Parameters = labelled(Parameters, config.parameters)
+    return own
 
 
 def scaled(settings: Any, config: Config) -> Any:
