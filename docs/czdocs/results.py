@@ -19,6 +19,7 @@ STEP = "pull_step_rms_mm_per_min"
 PIDS = ("paper", "paper-filtered", "paper-tuned", "pid-conventional", "industrial")
 LQGS = ("lqg", "lqg-quiet", "lqg-at-0.02", "lqg-at-0.02-adaptive")
 BOUNDS = ("lqg", "lqg-quiet", "lqg-true", "full-information", "clairvoyant")
+BUDGETS = tuple(f"{name}-{budget}M" for budget in (1, 5, 20) for name in ("ppo-plain", "ppo"))
 MEMBERS = ("0.005", "0.008", "0.013", "0.02", "0.03")
 """Frontier of the LQG: largest pull step RMS of each member [mm/min]."""
 METRICS = (
@@ -140,6 +141,7 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> Lines:
 TABLES: dict[str, Callable[[], Lines]] = {
     "figures-pid": partial(figures, "benchmark", PIDS),
     "figures-lqg": partial(figures, "benchmark", LQGS),
+    "figures-budgets": partial(figures, "budgets", BUDGETS, ("randomized", "puller")),
     "figures-bounds": partial(figures, "bounds", BOUNDS, SCENARIOS[:-1]),
     "figures-mpc": partial(figures, "bounds", ("lqg", "lqg-quiet", "ekf-mpc"), SCENARIOS[:-1]),
     "cluster": partial(copied, "cluster/table.md"),
@@ -149,6 +151,7 @@ TABLES: dict[str, Callable[[], Lines]] = {
     "machines": partial(copied, "other_machine/machines.txt"),
     "ratios": equal,
     "frontier": frontier,
+    "stock": partial(copied, "stock/table.md"),
     "searches-lqg": partial(searches, "lqg"),
     "searches-pid": partial(searches, "[!l]"),
 }
