@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from cz_gym.body.process import BODY
 from cz_gym.config import Config, make_config
-from cz_gym.crystal.parameters import STAGES
+from cz_gym.crystal.parameters import STAGES, named
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.env import CzEnv
 from cz_gym.errors import CzError
@@ -56,7 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="M",
         help="length of the run (180; of a stage 1.3 times its recipe's)",
     )
-    add("--stage", metavar="STAGE", help=f"part of a whole crystal, CzCrystal-v0: {', '.join(STAGES)}")
+    about = f"part of a whole crystal, CzCrystal-v0: {', '.join(STAGES)}, or a length [m]"
+    add("--stage", type=named, metavar="STAGE", help=about)
     parser.add_puller("pull its crystals")
     return parser.run(_play, arguments, "render")
 
@@ -96,7 +97,7 @@ def _play(arguments: argparse.Namespace) -> None:
     puller, pygame, stage = chosen_puller(arguments.puller), load(), arguments.stage
     config = make_config(
         arguments.scenario, None, "measured", horizon=arguments.minutes and arguments.minutes * MINUTE, action="rate",
-        puller=puller, process=CRYSTAL if stage else BODY, stage=stage,
+        puller=puller, process=BODY if stage is None else CRYSTAL, stage=stage,
     )  # fmt: skip
     if sys.platform.startswith(("linux", "freebsd")) and not any(map(os.environ.get, DISPLAYS)):
         raise CzError(NO_DISPLAY)

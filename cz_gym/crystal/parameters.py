@@ -74,6 +74,14 @@ def _shares(stage: Any, q: Any) -> dict[str, float]:
     return fields | {name: float(share) / total for name, share in shares.items()}
 
 
+def named(text: str) -> Any:
+    """A stage as a command line has it: a name, or a length [m]."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
 def parts(q: Any) -> tuple[Parameters, Recipe]:
     """The puller's and the recipe's numbers in the parameters."""
     return labelled(Parameters, q), labelled(Recipe, q)

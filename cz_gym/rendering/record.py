@@ -129,7 +129,7 @@ class CrystalRecord(Record):
 
     def __init__(self, config: Config, slot: Any, scenario: str) -> None:
         super().__init__(config, slot, scenario)
-        self._table = np.array(slot["table"])
+        self.table = np.array(slot["table"])
 
     @property
     def nominal(self) -> tuple[float, float, float]:
@@ -144,7 +144,7 @@ class CrystalRecord(Record):
     def _recipe(self, column: int) -> Floats:
         """A column of the recipe at each sample's length."""
         place = self.column("L") / recipe.spacing(self.puller) + recipe.MARGIN
-        values: Floats = np.interp(place, np.arange(recipe.ROWS), self._table[:, column])
+        values: Floats = np.interp(place, np.arange(recipe.ROWS), self.table[:, column])
         return values
 
     @property

@@ -10,7 +10,10 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
+from cz_gym.body.process import BODY
 from cz_gym.config import make_config
+from cz_gym.crystal.parameters import STAGES, named
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.errors import CzError
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.units import HOUR
@@ -34,7 +37,9 @@ def commands() -> OneLineParser:
     add("--seed", type=between(0, 2**31 - 1), default=1, metavar="N", help="which crystal (%(default)s)")
     add("--speed", type=between(0, 10_000), default=1, metavar="N",
         help="times faster than real time; 0: every step waits for its setpoints (%(default)s)")  # fmt: skip
-    add("--hours", type=between(1, 1000), default=3, metavar="N", help="length of the run (%(default)s)")
+    add("--stage", type=named, metavar="STAGE",
+        help=f"part of a whole crystal, CzCrystal-v0: {', '.join(STAGES)}, or a length [m]")  # fmt: skip
+    add("--hours", type=between(1, 1000), metavar="N", help="length of the run (3; of a stage 1.3 times its recipe's)")
     add("--wait", action="store_true", help="time begins with the first setpoints of a client")
     add("--watchdog", type=between(5, 86_400), default=60, metavar="S",
         help="time of the crystal after which setpoints that are not renewed give way [s] (%(default)s)")  # fmt: skip
@@ -74,6 +79,7 @@ def _is_loopback(host: str) -> bool:
 @asynccontextmanager
 async def serving(arguments: argparse.Namespace, door: Any) -> AsyncIterator[tuple[Any, asyncio.Task[None]]]:
     """Run a crystal, its server and page; yields the machine, and a task that ends only if the plant's thread fails."""
+    from .crystal import CrystalMachine
     from .files import Log, StateFile
     from .machine import Clock, Machine
     from .opcua import Tags, certify, pump
@@ -83,9 +89,13 @@ async def serving(arguments: argparse.Namespace, door: Any) -> AsyncIterator[tup
         await certify(arguments.certificates)
     log = Log(arguments.log, 1e6 * (arguments.log_size or math.inf)) if arguments.log else None
     state = StateFile(arguments.state) if arguments.state else None
-    horizon, puller = arguments.hours * HOUR, arguments.puller
-    config = make_config(arguments.scenario, None, "measured", horizon=horizon, action="direct", puller=puller)
-    machine = Machine(config, arguments.seed, arguments.watchdog, log, state)
+    horizon, puller, stage = arguments.hours and arguments.hours * HOUR, arguments.puller, arguments.stage
+    process, kind = (BODY, Machine) if stage is None else (CRYSTAL, CrystalMachine)
+    config = make_config(
+        arguments.scenario, None, "measured", horizon=horizon, action="direct", puller=puller, process=process,
+        stage=stage,
+    )  # fmt: skip
+    machine = kind(config, arguments.seed, arguments.watchdog, log, state)
     loop, queue = asyncio.get_running_loop(), asyncio.Queue[dict[str, Any]]()
     clock = Clock(
         machine, arguments.speed, arguments.wait, lambda tags: loop.call_soon_threadsafe(queue.put_nowait, tags)

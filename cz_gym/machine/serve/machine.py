@@ -85,20 +85,28 @@ class Machine:
     grew under other settings.
     """
 
+    tags: tuple[Tag, ...] = TAGS
+
     def __init__(
         self, config: Config, seed: int, watchdog: float, log: Log | None = None, state: StateFile | None = None
     ) -> None:
         self.env = CzEnv.from_config(config, "rgb_array", SIZE)
-        self.interval, self.watchdog, self._ranges = config.control_interval, watchdog, config.ranges
+        self.config, self.interval, self.watchdog, self._ranges = (
+            config,
+            config.control_interval,
+            watchdog,
+            config.ranges,
+        )
+        self._units = np.divide(self._ranges, (MM_PER_MIN, KILO))
         saved = state.load() if state else None
         self._observation, _ = self.env.reset(seed=seed, options=saved and {"state": saved.env})
-        self._record, self._log, self._state, self._lock = record_of(self.env), log, state, threading.RLock()
+        self._record: Any = record_of(self.env)
+        self._log, self._state, self._lock = log, state, threading.RLock()
         self.puller = self._record.puller
-        self._fallback = make_block(FALLBACK, config)
-        self._memory = self._fallback.start(1)
-        self._fixed: dict[str, Any] = {port.name: port.default for port in settings_of(config, self.puller)}
+        self._fallback = self._make_fallback()
+        self._memory = self._rest()
+        self._fixed = self._settings()
         self.limits = {name: [self._fixed[name.replace("setpoint", e)] for e in ("min", "max")] for name in SETPOINTS}
-        self.nominal = np.array([self.puller.v_0 / MM_PER_MIN, self.puller.Q_H_0 / KILO])
         self._fixed |= {"control_interval_s": self.interval, "watchdog_s": watchdog, "puller": config.puller.label}
         self._fixed["scenario"] = self._record.scenario
         self.k, self.answered, self.late, self.manual, self._renewed = 0, -1, False, False, -math.inf
@@ -115,18 +123,35 @@ class Machine:
             log.begin(self.k * self.interval if saved else None)
 
     @property
+    def nominal(self) -> Any:
+        """The drives at an action of zero [mm/min, kW]."""
+        return np.array([self.puller.v_0 / MM_PER_MIN, self.puller.Q_H_0 / KILO])
+
+    def _settings(self) -> dict[str, Any]:
+        return {port.name: port.default for port in settings_of(self.config, self.puller)}
+
+    def _make_fallback(self) -> Any:
+        return make_block(FALLBACK, self.config)
+
+    def _rest(self) -> Any:
+        """The fallback's memory before it takes over."""
+        return self._fallback.start(1)
+
+    @property
     def spans(self) -> dict[str, tuple[float, float]]:
         """Ranges of readings and drives by their tags: readings outside of theirs count as implausible."""
+        limits = {name: tuple(span) for name, span in self.limits.items()}
+        return self._reading_spans() | limits | dict(zip(SETPOINTS.values(), limits.values(), strict=True))
+
+    def _reading_spans(self) -> dict[str, tuple[float, float]]:
         ends = (decode(np.full(len(Measured._fields), end), *self._ranges) for end in (-CLIP, CLIP))
         low, high = (in_plant_units(end, self.puller) for end in ends)
-        limits = {name: tuple(span) for name, span in self.limits.items()}
-        spans = {name: (low[name], high[name]) for name in low if name != "valid"}
-        return spans | limits | dict(zip(SETPOINTS.values(), limits.values(), strict=True))
+        return {name: (low[name], high[name]) for name in low if name != "valid"}
 
     def _resume(self, saved: State) -> None:
         """Go on from a saved state."""
         kinds = {name: type(value) for name, value in saved.tags.items()}
-        sound = kinds == {tag.name: tag.kind for tag in TAGS} and saved.memory.shape == self._numbers.shape
+        sound = kinds == {tag.name: tag.kind for tag in self.tags} and saved.memory.shape == self._numbers.shape
         if not sound or set(saved.attributes) != set(SAVED):
             raise CzError("this state was saved by another version of cz_gym, or damaged")
         if saved.tags["alarms"] & Alarm.ENDED:
@@ -202,13 +227,10 @@ class Machine:
         with self._lock:
             control, before = self.control, self.hour[-1]
             if control == "fallback":
-                given = before | {"ring_time_s": self.k * self.interval, "automatic": True}
-                outputs, self._memory = self._fallback.run(given, self._memory)
-                self._active = [float(outputs[name][0]) for name in SETPOINTS]
+                self._active = self._fall_back()
             else:
-                self._memory = self._fallback.start(1)
-            move = np.subtract(self._active, self.nominal) / (self._ranges[0] / MM_PER_MIN, self._ranges[1] / KILO)
-            self._observation, *_ = self.env.step(move)
+                self._memory = self._rest()
+            self._observation, *_ = self.env.step((self._active - self.nominal) / self._units)
             self.k += 1
             tags = self._publish(control)
             if self._log is not None:
@@ -218,23 +240,31 @@ class Machine:
                 self._state.save(State(self.env.get_state(), self._numbers, attributes, tags))
             return tags
 
+    def _fall_back(self) -> list[float]:
+        """The fallback's setpoints for the step that begins now."""
+        given = self.hour[-1] | {"ring_time_s": self.k * self.interval, "automatic": True}
+        outputs, self._memory = self._fallback.run(given, self._memory)
+        return [float(outputs[name][0]) for name in SETPOINTS]
+
+    def _read(self) -> dict[str, Any]:
+        """The readings by their tags."""
+        return in_plant_units(decode(self._observation, *self._ranges), self.puller)
+
     def _publish(self, control: str = "held") -> dict[str, Any]:
         """Add the tags to the last hour's, and return them."""
-        ending = self._record.ending
-        seen = decode(self._observation.astype(float), *self._ranges)
+        ending, values = self._record.ending, self._fixed | self._read()
         bits = {
-            Alarm.CAMERA: seen.valid < 0.5, Alarm.HELD: control == "held", Alarm.FALLBACK: control == "fallback",
+            Alarm.CAMERA: values["valid"] < 0.5, Alarm.HELD: control == "held", Alarm.FALLBACK: control == "fallback",
             Alarm.MANUAL: control == "manual", Alarm.LATE: self.late, Alarm.ENDED: ending is not None,
         }  # fmt: skip
-        values = self._fixed | in_plant_units(seen, self.puller) | dict(zip(SETPOINTS, self._active, strict=True))
-        values |= {
+        values |= dict(zip(SETPOINTS, self._active, strict=True)) | {
             "time_s": self.k * self.interval, "state": "growing" if ending is None else ending.value.lower(),
             "control": control, "alarms": sum(bit for bit, holds in bits.items() if holds),
-            "valid": seen.valid > 0.5, "watchdog": max(self.answered, 0), "step": self.k,
+            "valid": values["valid"] > 0.5, "watchdog": max(self.answered, 0), "step": self.k,
         }  # fmt: skip
         for applied, limits in zip(SETPOINTS.values(), self.limits.values(), strict=True):
             values[applied] = np.clip(values[applied], *limits)  # actions are in single precision
-        tags = {tag.name: tag.kind(values[tag.name]) for tag in TAGS}
+        tags = {tag.name: tag.kind(values[tag.name]) for tag in self.tags}
         self.hour.append(tags)
         return tags
 

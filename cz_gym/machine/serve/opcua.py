@@ -31,11 +31,11 @@ WHOLE = {getattr(ua.VariantType, f"{sign}Int{bits}") for sign in ("", "U") for b
 WHOLE |= {ua.VariantType.SByte, ua.VariantType.Byte}
 TAKEN = {ua.VariantType.UInt32: WHOLE, ua.VariantType.Double: WHOLE | {ua.VariantType.Float, ua.VariantType.Double}}
 """Types that clients may write to a tag, by the tag's own."""
-KIND_OF = {tag.name: tag.kind for tag in TAGS}
-WRITABLE = {tag.name: KINDS[tag.kind] for tag in TAGS if tag.writable}
+KIND_OF = {tag.name: tag.kind for tag in TAGS if tag.writable}
+WRITABLE = {name: KINDS[kind] for name, kind in KIND_OF.items()}
 UNITS = {
     "_mm": ("mm", "MMT"), "_mm_per_min": ("mm/min", "H81"), "_K": ("K", "KEL"), "_kW": ("kW", "KWT"),
-    "_s": ("s", "SEC"),
+    "_s": ("s", "SEC"), "_kg": ("kg", "KGM"),
 }  # fmt: skip
 """Units by the endings of tags: name, and common code of UNECE Recommendation 20."""
 CODES = "http://www.opcfoundation.org/UA/units/un/cefact"
@@ -125,7 +125,7 @@ class Writes(AttributeService):  # type: ignore[misc]
         if any(codes):
             return [ua.StatusCode(code or ua.StatusCodes.BadInvalidState) for code in codes]
         for each in params.NodesToWrite:
-            each.Value = data_value(self.nodes[each.NodeId], each.Value.Value.Value)
+            each.Value = data_value(KIND_OF[self.nodes[each.NodeId]], each.Value.Value.Value)
         return await super().write(params, User(UserRole.Admin))  # type: ignore[no-any-return]
 
     def _check(self, write: Any, user: str) -> int:
@@ -165,7 +165,7 @@ class Tags:
         space = await server.register_namespace(f"{URI}:tags")
         puller = await server.nodes.objects.add_object(ua.NodeId("tags", space), f"{space}:Puller")
         values = self.machine.hour[-1]
-        for tag in TAGS:
+        for tag in self.machine.tags:
             node_id = self.nodes[tag.name] = ua.NodeId(tag.name, space)
             node = await puller.add_variable(node_id, f"{space}:{tag.name}", values[tag.name], KINDS[tag.kind])
             await self._describe(node, tag, space)
@@ -201,14 +201,13 @@ class Tags:
     async def publish(self, values: dict[str, Any]) -> None:
         """Show values; ``step`` comes last, so that whoever sees a new step sees all that belongs to it."""
         now = datetime.now(UTC)
-        for tag in TAGS:
-            value = data_value(tag.name, values[tag.name], now)
+        for tag in self.machine.tags:
+            value = data_value(tag.kind, values[tag.name], now)
             await self.server.write_attribute_value(self.nodes[tag.name], value)
 
 
-def data_value(name: str, value: Any, now: datetime | None = None) -> ua.DataValue:
+def data_value(kind: type, value: Any, now: datetime | None = None) -> ua.DataValue:
     """The value of a tag in the type that the tag has."""
-    kind = KIND_OF[name]
     return ua.DataValue(ua.Variant(kind(value), KINDS[kind]), SourceTimestamp=now, ServerTimestamp=now)
 
 
