@@ -8,18 +8,16 @@ import numpy as np
 
 from cz_gym.crystal.parameters import STAGES
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.crystal.recipe import ROWS, _Q_H, _ring, _v_p, value
+from cz_gym.crystal.recipe import _Q_H, _ring, _v_p, value
 from cz_gym.machine.export.controllers import REGISTRY
-from cz_gym.machine.export.ports import SETPOINTS, in_plant_units
+from cz_gym.machine.export.ports import SETPOINTS
 from cz_gym.observation import Measured, decode
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
 
 from .machine import TAGS, Machine, Tag
 
-FALLBACK = "compensated"
-"""Name of the controller that takes over."""
 LATER = {"_1min": "_5mm", "_5min": "_25mm", "in 1 minute": "5 mm later", "in 5 minutes": "25 mm later"}
-"""Words of the tags of ``Cz-v0`` by time, and those of a crystal by length."""
+"""Words in the tags of ``Cz-v0``, where references run with time, and those of a crystal."""
 
 
 def by_length(text: str) -> str:
@@ -40,61 +38,44 @@ OWN_TAGS = (
 
 
 class CrystalMachine(Machine):
-    """A puller with one whole crystal or a stage of it; setpoints are absolute, and the recipe is among the tags.
-
-    The fallback is the controller :data:`FALLBACK`; it holds the drives that it finds, and the recipe's temperature is
-    shifted to what the pyrometer shows then.
-    """
+    """A puller with one whole crystal or a part of it; the controller ``compensated`` takes over."""
 
     tags = (*(t._replace(name=by_length(t.name), meaning=by_length(t.meaning)) for t in TAGS[:-1]), *OWN_TAGS, TAGS[-1])
 
     @property
     def nominal(self) -> Any:
-        """The recipe's drives at the length of the step that begins now [mm/min, kW]."""
-        u = CRYSTAL.nominal(SimpleNamespace(L=self._record.last("L")), self._slot, self.interval)
+        """The recipe's drives in the step that begins now [mm/min, kW]."""
+        u = CRYSTAL.nominal(SimpleNamespace(L=self._record.last("L")), self._record, self.interval)
         return np.array([u.v_p / MM_PER_MIN, u.Q_H / KILO])
 
-    @property
-    def _slot(self) -> Any:
-        """The drawn puller and the table of its recipe."""
-        return SimpleNamespace(puller=self.puller, table=self._record.table)
-
     def _settings(self) -> dict[str, Any]:
-        """Those of ``Cz-v0``; the drives' limits are the recipe's least and largest, give or take their ranges."""
-        of_recipe = self._record.table[:, [_v_p, _Q_H]]
-        room = np.array([min(self._ranges[0], self.config.puller.pull_room), self._ranges[1]])
-        low, high = np.maximum(of_recipe.min(axis=0) - room, 0.0), of_recipe.max(axis=0) + room
-        names = ("pull_speed_{}_mm_per_min", MM_PER_MIN), ("heater_power_{}_kW", KILO)
-        ends = {"min": low, "max": high}
-        limits = {
-            name.format(end): float(at[i] / unit) for end, at in ends.items() for i, (name, unit) in enumerate(names)
-        }
-        return super()._settings() | limits
+        """Those of ``Cz-v0``, with the least and the largest drives that the recipe and their ranges allow."""
+        drives = self._record.table[:, [_v_p, _Q_H]] / (MM_PER_MIN, KILO)
+        room = np.minimum(self._units, (self.config.puller.pull_room / MM_PER_MIN, np.inf))
+        limits = np.maximum(drives.min(axis=0) - room, 0.0), drives.max(axis=0) + room
+        names = [name.replace("setpoint", end) for end in ("min", "max") for name in SETPOINTS]
+        return super()._settings() | dict(zip(names, np.ravel(limits).tolist(), strict=True))
 
-    def _reading_spans(self) -> dict[str, tuple[float, float]]:
-        """None: along a crystal readings have no fixed range."""
-        return {}
+    def _in_plant_units(self, seen: Any) -> dict[str, Any]:
+        units = super()._in_plant_units(Measured(*seen[: len(Measured._fields)]))
+        return {by_length(name): reading for name, reading in units.items()}
 
     def _read(self) -> dict[str, Any]:
-        """The readings, and the crystal's own tags."""
         seen, last = decode(self._observation, *self._ranges, CRYSTAL), self._record.last
-        bias = value(last("L"), self._slot, _ring)
-        ring = seen.ring_error + bias - self.puller.ring_bias
-        v_p, Q_H = seen.v_p + seen.v_p_ref, seen.Q_H + seen.Q_H_ref
-        body = Measured(*seen[: len(Measured._fields)])._replace(ring_error=ring, v_p=v_p, Q_H=Q_H)
-        now = STAGES[int(last("stage"))], last("L") / MM, last("weight") / self.puller.g, *self.nominal
-        read = {by_length(name): reading for name, reading in in_plant_units(body, self.puller).items()}
-        return read | {"ring_bias_mm": bias / MM} | {t.name: each for t, each in zip(OWN_TAGS, now, strict=True)}
+        bias = value(last("L"), self._record, _ring)
+        own = STAGES[int(last("stage"))], last("L") / MM, last("weight") / self.puller.g, *self.nominal
+        seen = seen._replace(ring_error=seen.ring_error + bias - self.puller.ring_bias)
+        drives = {"v_p": seen.v_p + seen.v_p_ref, "Q_H": seen.Q_H + seen.Q_H_ref}
+        shown = dict(zip((tag.name for tag in OWN_TAGS), own, strict=True)) | {"ring_bias_mm": bias / MM}
+        return self._in_plant_units(seen._replace(**drives)) | shown
 
     def _make_fallback(self) -> Any:
-        return pkgutil.resolve_name(f"{REGISTRY}:make_controller")(FALLBACK, self.config)
+        return pkgutil.resolve_name(f"{REGISTRY}:make_controller")("compensated", self.config)
 
     def _rest(self) -> Any:
-        """The memory of the fallback that begins with the newest sample."""
-        return self._fallback.predict(self._observation[None])[1]
+        return self._fallback.predict(self._observation)[1]
 
     def _fall_back(self) -> list[float]:
-        action, self._memory = self._fallback.predict(self._observation[None], self._memory)
-        wanted = self.nominal + np.asarray(action[0]) * self._units
-        limits = np.array(list(self.limits.values())).T
-        return [float(each) for each in np.clip(wanted, *limits)]
+        action, self._memory = self._fallback.predict(self._observation, self._memory)
+        setpoints: list[float] = np.maximum(self.nominal + np.asarray(action) * self._units, 0.0).tolist()
+        return setpoints

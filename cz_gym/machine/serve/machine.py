@@ -15,7 +15,7 @@ from cz_gym.env import CzEnv
 from cz_gym.errors import CzError
 from cz_gym.machine.export.controllers import FALLBACK, make_block
 from cz_gym.machine.export.ports import INPUTS, OUTPUTS, SETPOINTS, in_plant_units, settings_of
-from cz_gym.observation import CLIP, Measured, decode
+from cz_gym.observation import CLIP, decode
 from cz_gym.rendering.canvas import Frame
 from cz_gym.rendering.view import record_of
 from cz_gym.support.nested import leaves, map_arrays
@@ -140,13 +140,12 @@ class Machine:
     @property
     def spans(self) -> dict[str, tuple[float, float]]:
         """Ranges of readings and drives by their tags: readings outside of theirs count as implausible."""
+        process, size = self.config.process, len(self._observation)
+        ends = (decode(np.full(size, end), *self._ranges, process) for end in (-CLIP, CLIP))
+        low, high = map(self._in_plant_units, ends)
         limits = {name: tuple(span) for name, span in self.limits.items()}
-        return self._reading_spans() | limits | dict(zip(SETPOINTS.values(), limits.values(), strict=True))
-
-    def _reading_spans(self) -> dict[str, tuple[float, float]]:
-        ends = (decode(np.full(len(Measured._fields), end), *self._ranges) for end in (-CLIP, CLIP))
-        low, high = (in_plant_units(end, self.puller) for end in ends)
-        return {name: (low[name], high[name]) for name in low if name != "valid"}
+        spans = {name: (low[name], high[name]) for name in low if name != "valid"}
+        return spans | limits | dict(zip(SETPOINTS.values(), limits.values(), strict=True))
 
     def _resume(self, saved: State) -> None:
         """Go on from a saved state."""
@@ -246,9 +245,12 @@ class Machine:
         outputs, self._memory = self._fallback.run(given, self._memory)
         return [float(outputs[name][0]) for name in SETPOINTS]
 
+    def _in_plant_units(self, seen: Any) -> dict[str, Any]:
+        return in_plant_units(seen, self.puller)
+
     def _read(self) -> dict[str, Any]:
-        """The readings by their tags."""
-        return in_plant_units(decode(self._observation, *self._ranges), self.puller)
+        """The newest values of the tags that a step changes."""
+        return self._in_plant_units(decode(self._observation, *self._ranges))
 
     def _publish(self, control: str = "held") -> dict[str, Any]:
         """Add the tags to the last hour's, and return them."""

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from cz_gym.config import make_config
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.errors import CzError
 from cz_gym.machine.export.ports import SETPOINTS
 from cz_gym.machine.puller import PullerFile
+from cz_gym.machine.serve.crystal import CrystalMachine
 from cz_gym.machine.serve.files import Log, StateFile
 from cz_gym.machine.serve.machine import Alarm, Clock, Machine
 
@@ -175,3 +177,37 @@ def test_an_error_in_the_clock_reaches_whoever_waits():
     clock.join(10.0)
     assert sent == [{}]
     assert isinstance(clock.error, ZeroDivisionError)
+
+
+def test_a_crown_without_setpoints_completes_under_the_fallback_and_goes_on_from_its_state(tmp_path):
+    file = StateFile(tmp_path / "state")
+
+    def grown(last, state=None):
+        config = make_config("puller", None, "measured", action="direct", process=CRYSTAL, stage="crown")
+        one = CrystalMachine(config, 1, 60.0, None, state)
+        return [one.step() for _ in iter(lambda: one.over or one.k >= last, True)]
+
+    whole = grown(10_000)
+    assert grown(400, file) == whole[:400]
+    assert grown(10_000, file) == whole[400:], "the fallback has a memory"
+    assert whole[-1]["state"] == "grown: the length is reached"
+    assert {row["control"] for row in whole} == {"fallback"}
+    assert [*dict.fromkeys(row["stage"] for row in whole)] == ["crown", "body"]
+    assert (np.diff([row["length_mm"] for row in whole]) > 0.0).all()
+    assert whole[-1]["weight_kg"] > 5.0 > 0.2 > whole[0]["weight_kg"]
+    assert max(abs(row["ring_radius_mm"] - row["ring_bias_mm"] - row["r_ref_mm"]) for row in whole) < 8.0
+
+
+def test_setpoints_of_a_crystal_are_absolute_and_those_of_the_recipe_follow_it():
+    config = make_config("nominal", None, "measured", action="direct", process=CRYSTAL, stage="crown")
+    one = CrystalMachine(config, 1, 60.0)
+    for _ in range(200):
+        recipe = [one.hour[-1][name] for name in ("pull_speed_recipe_mm_per_min", "heater_power_recipe_kW")]
+        assert one.offer(dict(zip(SETPOINTS, recipe, strict=True)) | {"watchdog": one.k}) == {}
+        row = one.step()
+        assert [row[applied] for applied in SETPOINTS.values()] == pytest.approx(recipe, rel=1e-6)
+        assert row["ring_radius_mm"] - row["ring_bias_mm"] == pytest.approx(row["r_ref_mm"], abs=0.05)
+    assert one.offer({PULL: 2.0, HEATER: 50.0, "watchdog": one.k}) == {}
+    row = one.step()
+    assert (row["pull_speed_mm_per_min"], row["heater_power_kW"]) == pytest.approx((2.0, 50.0))
+    assert list(one.offer({PULL: 4.0})) == [PULL]

@@ -297,6 +297,8 @@ def test_it_listens_on_the_loopback_unless_told_and_elsewhere_only_with_a_user(r
     monkeypatch.setenv("CZ_GYM_OPERATOR_PASSWORD", "short")
     assert "at least 8 characters" in refused(command.main, ["--operator", "olga"])
     assert re.search("did you mean", refused(command.main, ["--scenario", "pulller"]))
+    assert "must be one of" in refused(command.main, ["--stage", "whol"])
+    assert "stage = 9 m begins outside of the crystal" in refused(command.main, ["--stage", "9"])
 
 
 def test_a_port_that_is_taken_and_half_a_certificate_are_said_in_one_line(puller, refused, tmp_path, monkeypatch):
