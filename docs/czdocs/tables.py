@@ -19,7 +19,8 @@ from cz_gym.crystal.process import CRYSTAL
 from cz_gym.episodes.scenario import FAMILIES
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.machine.puller import DEFAULT, value_of
-from cz_gym.machine.serve.machine import TAGS
+from cz_gym.machine.serve.crystal import OWN_TAGS
+from cz_gym.machine.serve.machine import TAGS, Tag
 from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, STATE, Channel
 from cz_gym.physics.parameters import describe
 from cz_gym.physics.quantities import MACHINE, Quantity
@@ -163,6 +164,11 @@ def exported() -> list[str]:
     return markdown(("controller", "C", "largest difference of an action", "rows of the table that differ"), rows)
 
 
+def tags(listed: tuple[Tag, ...]) -> list[str]:
+    """Tags of the virtual puller."""
+    return markdown(("tag", "type", "meaning"), ((code(t.name), t.kind.__name__, t.meaning) for t in listed))
+
+
 TABLES: dict[str, Callable[[], list[str]]] = {
     "measured": lambda: channels(MEASURED),
     "history": remembered,
@@ -175,7 +181,8 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "families": families,
     "camera": camera,
     "exported": exported,
-    "tags": lambda: markdown(("tag", "type", "meaning"), ((code(t.name), t.kind.__name__, t.meaning) for t in TAGS)),
+    "tags": partial(tags, TAGS),
+    "crystal-tags": partial(tags, OWN_TAGS),
     "puller": puller,
     **{part: partial(symbols, part) for part in nomenclature.ROWS},
     **results.TABLES,

@@ -16,7 +16,10 @@ from cz_gym.support.units import KILO, MM, MM_PER_MIN
 
 from .machine import TAGS, Machine, Tag
 
-LATER = {"_1min": "_5mm", "_5min": "_25mm", "in 1 minute": "5 mm later", "in 5 minutes": "25 mm later"}
+LATER = {
+    "_1min": "_5mm", "_5min": "_25mm", "in 1 minute": "5 mm later", "in 5 minutes": "25 mm later",
+    " now": " at this length", "at nominal": "at this length",
+}  # fmt: skip
 """Words in the tags of ``Cz-v0``, where references run with time, and those of a crystal."""
 
 

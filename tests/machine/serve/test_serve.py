@@ -297,7 +297,7 @@ def test_it_listens_on_the_loopback_unless_told_and_elsewhere_only_with_a_user(r
     monkeypatch.setenv("CZ_GYM_OPERATOR_PASSWORD", "short")
     assert "at least 8 characters" in refused(command.main, ["--operator", "olga"])
     assert re.search("did you mean", refused(command.main, ["--scenario", "pulller"]))
-    assert "must be one of" in refused(command.main, ["--stage", "whol"])
+    assert "did you mean 'whole'?" in refused(command.main, ["--stage", "whol"])
     assert "stage = 9 m begins outside of the crystal" in refused(command.main, ["--stage", "9"])
 
 
