@@ -50,6 +50,9 @@ class Learner(NamedTuple):
 LEARNERS = {
     "ppo, 8 crystals": Learner("ppo", 8, scaled=False),
     "ppo, 8 crystals, VecNormalize": Learner("ppo", 8, normalised=True),
+    "ppo, 8 crystals, VecNormalize, smaller steps": Learner(
+        "ppo", 8, normalised=True, settings=(("learning_rate", 3e-5),)
+    ),
     "ppo, 16 crystals, VecNormalize": Learner("ppo", 16, normalised=True),
 }
 HEADS = ("learner", "steps", "training seeds", "RMSE of each seed [mm]", "lost of each seed [%]")

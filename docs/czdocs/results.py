@@ -30,6 +30,16 @@ METRICS = (
     ("failure_rate", "crystals lost [share]", "{:.3f}"),
 )
 """Rows of a table of figures: metric, its words, its format."""
+WHOLE = (
+    ("failure_rate", "crystals lost [share]", "{:.3f}"),
+    ("crown_max_mm", "largest error of the crown, mean [mm]", "{:.2f}"),
+    ("body_rmse_mm", "RMSE of the body [mm]", "{:.3f}"),
+    ("body_within_half", "body within 0.5 mm [share]", "{:.3f}"),
+    ("v_over_G_within_3pct", "v/G within 3 % [share]", "{:.2f}"),
+    ("tail_max_mm", "largest error of the tail, mean [mm]", "{:.2f}"),
+    ("kwh_per_kg", "heater's energy [kWh/kg]", "{:.2f}"),
+)
+"""The same of whole crystals."""
 Lines = list[str]
 
 
@@ -39,12 +49,14 @@ def run(name: str) -> Any:
     return json.loads((ROOT / "results" / name / "benchmark.json").read_text())
 
 
-def figures(name: str, controllers: Sequence[str], scenarios: Sequence[str] = SCENARIOS) -> Lines:
+def figures(
+    name: str, controllers: Sequence[str], scenarios: Sequence[str] = SCENARIOS, metrics: Any = METRICS
+) -> Lines:  # fmt: skip
     """Means of a run: a column a controller, a row a scenario and metric."""
     rows = []
     for scenario in scenarios:
         of = run(name)["results"].get(scenario, {})
-        for metric, words, shown in METRICS:
+        for metric, words, shown in metrics:
             cells = [shown.format(of[each][metric]["mean"]) if each in of else "-" for each in controllers]
             rows.append((f"{scenario}: {words}", *cells))
     return table(("", *map(code, controllers)), rows)
@@ -151,6 +163,7 @@ TABLES: dict[str, Callable[[], Lines]] = {
     "machines": partial(copied, "other_machine/machines.txt"),
     "ratios": equal,
     "frontier": frontier,
+    "whole": partial(figures, "whole", ("compensated", "lqg-along", "gradient-along"), ("whole",), WHOLE),
     "stock": partial(copied, "stock/table.md"),
     "searches-lqg": partial(searches, "lqg"),
     "searches-pid": partial(searches, "[!l]"),
