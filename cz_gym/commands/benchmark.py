@@ -37,7 +37,7 @@ BOUNDS = RESULTS / "bounds"
 """Folder of committed results of the slow controllers; their bound serves runs without one."""
 EPISODES = 500
 """Largest number of test episodes."""
-USUAL = {"Cz-v0": EPISODES, "CzCrystal-v0": 100}
+USUAL = {"Cz-v0": EPISODES, "CzCrystal-v0": EPISODES}
 """Number of test episodes of the committed results."""
 
 
