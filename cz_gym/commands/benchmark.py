@@ -36,9 +36,7 @@ CACHE = RESULTS / "cache"
 BOUNDS = RESULTS / "bounds"
 """Folder of committed results of the slow controllers; their bound serves runs without one."""
 EPISODES = 500
-"""Largest number of test episodes."""
-USUAL = {"Cz-v0": EPISODES, "CzCrystal-v0": EPISODES}
-"""Number of test episodes of the committed results."""
+"""Number of test episodes: of the committed results, and the largest there is."""
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -51,8 +49,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     add = parser.add_argument
     about = "environment (%(default)s); of a whole crystal the scenarios are its stages"
     add("--env", choices=ENVIRONMENTS, default="Cz-v0", help=about)
-    about = f"first N test episodes ({', '.join(f'{number} of {name}' for name, number in USUAL.items())})"
-    add("--episodes", type=between(1, EPISODES), metavar="N", help=about)
+    about = "first N test episodes (%(default)s)"
+    add("--episodes", type=between(1, EPISODES), default=EPISODES, metavar="N", help=about)
     add("--controllers", type=_names, metavar="A,B", help='controllers and agents by name, or "all"')
     add("--scenarios", type=_names, metavar="A,B", help="scenarios by name")
     add("--out", type=Path, metavar="DIR", help=f"folder for the results ({shown(FOLDER)}; of your own: runs/NAME)")
@@ -74,7 +72,6 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     add("--overwrite", action="store_true", help="replace files of earlier or other runs")
     add("--quiet", action="store_true", help="no progress bar, no table; a bar is shown on a terminal only")
     given = parser.parse_args(argv)
-    given.episodes = given.episodes or USUAL[given.env]
     return given
 
 
@@ -208,4 +205,4 @@ def is_partial(arguments: argparse.Namespace, contenders: Sequence[Contender], r
     usual_rows = {row for row in ENVIRONMENTS[arguments.env] if row.default}
     missing = usual - {each.name for each in contenders} or usual_rows - set(rows)
     own = arguments.agent or arguments.controller or arguments.scenario or arguments.puller
-    return bool(arguments.episodes < USUAL[arguments.env] or missing or own)
+    return bool(arguments.episodes < EPISODES or missing or own)
