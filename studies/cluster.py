@@ -79,7 +79,7 @@ def table(cache: Path) -> str:
         ("on paper: workers that one scheduler keeps busy with such tasks", f"{each / empty:.0f}"),
         (f"on paper: results of {MANY} such workers [MB/s]", f"{MANY * result / each / 1e6:.0f}"),
     ]
-    return markdown(("", "measured"), rows)
+    return "# Tasks on a cluster\n\n" + markdown(("", "measured"), rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

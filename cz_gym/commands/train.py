@@ -115,8 +115,9 @@ def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tupl
     if begun and not arguments.resume:
         raise CzError(f"{begun[0]} holds a run already: --resume it, or name another --out")
     saved = read_settings((begun or folders)[0] / "settings.json") if arguments.resume else {}
-    name, settings = arguments.algo or saved.get("algorithm", DEFAULT), saved.get("settings", {})
+    settings, agents = saved.get("settings", {}), saved.get("algorithm", DEFAULT)
     recipes = CRYSTAL_RECIPES if (arguments.env or settings.get("environment")) == CRYSTAL else RECIPES
+    name = arguments.algo or {recipe.name: key for key, recipe in recipes.items()}.get(agents, agents)
     if name not in recipes:
         raise CzError(f"{name!r} is no recipe here: name one of {', '.join(recipes)} by --algo")
     chosen = {

@@ -23,6 +23,6 @@ def test_the_figures_are_of_as_many_workers_as_they_say(tmp_path, monkeypatch):
     monkeypatch.setattr(distributed, "LocalCluster", counted)
     assert cluster.main(["--out", str(tmp_path / "out" / "table.md")]) == 0
     assert asked == [1, 2]
-    rows = [line.split("|")[2] for line in (tmp_path / "out" / "table.md").read_text().splitlines()[2:] if line]
+    rows = [line.split("|")[2] for line in (tmp_path / "out" / "table.md").read_text().splitlines()[4:] if line]
     assert len(rows) == 9
     assert all(float(row) > 0.0 for row in rows[1:7])

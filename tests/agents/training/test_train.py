@@ -26,7 +26,7 @@ ALONG = {name: getattr(CRYSTAL_RECIPES["ppo"], name) for name in ("environment",
 @pytest.fixture
 def quick(monkeypatch, few_crystals):
     monkeypatch.setitem(RECIPES, "ppo", QUICK)
-    monkeypatch.setitem(CRYSTAL_RECIPES, "ppo", replace(QUICK, **ALONG))
+    monkeypatch.setitem(CRYSTAL_RECIPES, "ppo", replace(QUICK, name="ppo-along", **ALONG))
     for recipes in (RECIPES, CRYSTAL_RECIPES):
         monkeypatch.setitem(recipes, "gradient", replace(recipes["gradient"], num_envs=64, window=12))
 
@@ -82,9 +82,9 @@ def ctrl_c():
 def test_a_run_on_whole_crystals_goes_on_and_its_agent_is_for_these(algorithm, tmp_path, capsys):
     folder = tmp_path / "run"
     assert train.main(["--env", "CzCrystal-v0", "--algo", algorithm, "--steps", "6000", "--out", str(folder)]) == 0
-    assert "on CzCrystal-v0 (crown, body, tail), randomized, into" in capsys.readouterr().out
+    assert "on CzCrystal-v0 (crown, body, tail), 0.5 hard + 0.5 randomized, into" in capsys.readouterr().out
     contract = OnnxPolicy.load(folder / "agent.onnx").contract
-    assert (contract.environment, contract.algorithm) == ("CzCrystal-v0", algorithm)
+    assert (contract.environment, contract.algorithm) == ("CzCrystal-v0", f"{algorithm}-along")
     before = rows(folder / "progress.csv")
     assert list(before[-1])[-2:] == ["compensated_rmse_mm", "lqg-along_rmse_mm"]
     assert train.main(["--resume", "--steps", "12000", "--out", str(folder)]) == 0
@@ -92,7 +92,7 @@ def test_a_run_on_whole_crystals_goes_on_and_its_agent_is_for_these(algorithm, t
     with pytest.raises(AgentFileError, match=r"agent.onnx: trained for CzCrystal-v0, not for Cz-v0$"):
         load(folder / "agent.onnx", make_config())
     assert train.main(["--env", "Cz-v0", "--resume", "--out", str(folder)]) == 2
-    assert "the run was begun with another settings" in capsys.readouterr().err
+    assert f"'{algorithm}-along' is no recipe here" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("quick", "ctrl_c")
