@@ -9,15 +9,14 @@ import csv
 import io
 import sys
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
 from cz_gym.agents.export import to_agent
-from cz_gym.agents.from_sb3 import ALGORITHMS
 from cz_gym.agents.training.validation import JUDGING, validate
 from cz_gym.baselines.registry import make_controller
 from cz_gym.config import make_config
@@ -25,35 +24,28 @@ from cz_gym.errors import CzError
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.sb3 import make_vec_env
 from cz_gym.support.atomic_files import write_files
-from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.names import unknown
 
 MILLION = 1_000_000
+"""Steps after which a learner is judged, and again after as many."""
 
 
 class Learner(NamedTuple):
-    """A learner of stable-baselines3 or its contrib package, and what a user would set."""
+    """stable-baselines3's PPO on its defaults, but for what a user would set."""
 
-    algorithm: str
-    envs: int
-    normalised: bool = False
-    """Whether ``VecNormalize`` scales observations too, as its default is; rewards it always scales."""
-    scaled: bool = True
-    """Whether ``VecNormalize`` is there at all."""
-    policy: str = "MlpPolicy"
-    observation: str = "history"
-    action_repeat: int = 1
-    steps: int = 2 * MILLION
-    settings: tuple[tuple[str, Any], ...] = ()
+    crystals: int
+    """Number of crystals at a time."""
+    normalised: bool
+    """Whether ``VecNormalize``, on its defaults, is around the environment."""
+    learning_rate: float = 3e-4
 
 
 LEARNERS = {
-    "ppo, 8 crystals": Learner("ppo", 8, scaled=False),
-    "ppo, 8 crystals, VecNormalize": Learner("ppo", 8, normalised=True),
-    "ppo, 8 crystals, VecNormalize, smaller steps": Learner(
-        "ppo", 8, normalised=True, settings=(("learning_rate", 3e-5),)
-    ),
-    "ppo, 16 crystals, VecNormalize": Learner("ppo", 16, normalised=True),
+    "ppo, 8 crystals": Learner(8, normalised=False),
+    "ppo, 8 crystals, VecNormalize": Learner(8, normalised=True),
+    "ppo, 8 crystals, VecNormalize, smaller steps": Learner(8, normalised=True, learning_rate=3e-5),
+    "ppo, 16 crystals, VecNormalize": Learner(16, normalised=True),
 }
 HEADS = ("learner", "steps", "training seeds", "RMSE of each seed [mm]", "lost of each seed [%]")
 COLUMNS = ("learner", "seed", "steps", "rmse_mm", "lost")
@@ -65,16 +57,13 @@ ABOUT = """# Stock learners: stable-baselines3 on the environment as it comes
 def train(name: str, seed: int) -> list[tuple[Any, ...]]:
     """Rows of :data:`COLUMNS`: one learner, one training seed, at each million steps."""
     torch.set_num_threads(1)
-    learner = LEARNERS[name]
-    env = make_vec_env(learner.envs, action_repeat=learner.action_repeat, observation=learner.observation)
-    if learner.scaled:
-        env = VecNormalize(env, norm_obs=learner.normalised)
-    module, _, kind = ALGORITHMS[learner.algorithm].partition(":")
-    config = make_config("randomized", None, learner.observation)
-    model = getattr(import_module(module), kind)(learner.policy, env, seed=seed, device="cpu", **dict(learner.settings))
+    learner, config = LEARNERS[name], make_config("randomized")
+    env = make_vec_env(learner.crystals)
+    env = VecNormalize(env) if learner.normalised else env
+    model = PPO("MlpPolicy", env, learner.learning_rate, seed=seed, device="cpu")
     rows = list[tuple[Any, ...]]()
-    for steps in range(MILLION, learner.steps + 1, MILLION):
-        model.learn(MILLION // learner.action_repeat, reset_num_timesteps=False)
+    for steps in (MILLION, 2 * MILLION):
+        model.learn(MILLION, reset_num_timesteps=False)
         agent = to_agent(model, "stock", seed, config, model.get_vec_normalize_env(), "stock.onnx")
         judged = validate(agent, config, JUDGING)
         rows.append((name, seed, steps, f"{judged.rmse_mm:.4f}", f"{judged.failure_rate:.4f}"))
@@ -100,7 +89,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser(prog="python -m studies.stock", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("learners", nargs="*", metavar="LEARNER", help=f"of: {'; '.join(LEARNERS)} (default: all)")
-    parser.add_argument("--seeds", type=int, default=3, help="training seeds of each (default: %(default)s)")
+    parser.add_argument(
+        "--seeds", type=between(1, 100), default=3, help="training seeds of each (default: %(default)s)"
+    )
     parser.add_argument("--out", type=Path, default=Path("results/stock"), help="folder (default: %(default)s)")
     return parser.run(_main, arguments, "agents")
 
