@@ -1,8 +1,10 @@
 """A linear quadratic Gaussian regulator of a whole crystal: Kalman filter and regulator at each length of the recipe.
 
 Both are solved for the linearisation at some lengths, as if the crystal stayed there, and interpolated between, once
-for each of several shares of conduction. The model has three states that are not the plant's: the interface's slow
-fluctuation, the drift of the hot zone, which the recipe that is given follows, and the error of that recipe. SI units.
+for each of several shares of conduction. The filter reads ring, pyrometer and load cell: a radius that is too small and
+a meniscus that is too high look alike to the camera in the crown, but weigh differently. The model has three states
+that are not the plant's: the interface's slow fluctuation, the drift of the hot zone, which the recipe that is given
+follows, and the error of that recipe. SI units.
 """
 
 import math
@@ -22,11 +24,14 @@ from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN
 
 from .pid import in_cones
 
-PLANT, EXOGENOUS, DRIVES = 5, 3, 2
-STATES = PLANT + EXOGENOUS
-"""r_c, h_c, T_1, T_2, T_b, then the fluctuation, the drift and the recipe's error [K]."""
-_SIZES = np.array([MM, MM, *[1.0] * 6, MM_PER_MIN, KILO])
+REGULATED, STATES, DRIVES = 8, 9, 2
+"""r_c, h_c, T_1, T_2, T_b, then the fluctuation, the drift and the recipe's error [K], then the crystal's mass [kg],
+which is estimated and not regulated."""
+_PLANT, _EXOGENOUS = [0, 1, 2, 3, 4, 8], slice(5, 8)
+_SIZES = np.array([MM, MM, *[1.0] * 6, 0.1, MM_PER_MIN, KILO])
 """Sizes of the states and the drives, in SI units."""
+_SEEN = np.array([MM, 1.0, 1.0])
+"""Sizes of what is seen: ring [m], pyrometer [K], load cell [N]."""
 
 
 class Noise(NamedTuple):
@@ -36,12 +41,16 @@ class Noise(NamedTuple):
     """Noise of the ring [m]."""
     pyrometer: float = 0.1
     """Noise of the pyrometer [K]."""
+    weight: float = 0.4
+    """Noise of the load cell [N]."""
     height: float = 2.0e-7
     """Walk of the height in the body, for what the model lacks [m/sqrt(s)]."""
     cones: float = 1.0
     """The same in crown and tail, in multiples of the body's [-]."""
     temperature: float = 3.0e-3
     """Walk of each temperature [K/sqrt(s)]."""
+    mass: float = 1.0e-4
+    """Walk of the crystal's mass, for what the model lacks [kg/sqrt(s)]."""
     fluctuation: float = 0.4
     """Standard deviation of the interface's fluctuation [K]."""
     tau: float = 400.0
@@ -99,32 +108,37 @@ def _at(A: Floats, B: Floats, C: Floats, load: float, dt: float, noise: Noise, w
     """A, B and C in discrete time, K and F at one length."""
     rates = 1.0 / np.array([noise.tau, noise.slow, noise.slow])
     whole = np.zeros((STATES + DRIVES, STATES + DRIVES))
-    whole[:PLANT, :PLANT], whole[:PLANT, STATES:] = A, B[:, :DRIVES]
-    whole[:PLANT, PLANT], whole[:PLANT, PLANT + 1] = B[:, 3], load * B[:, 2]
-    whole[PLANT:STATES, PLANT:STATES] = -np.diag(rates)
+    whole[np.ix_(_PLANT, _PLANT)], whole[_PLANT, STATES:] = A, B[:, :DRIVES]
+    whole[_PLANT, 5], whole[_PLANT, 6] = B[:, 3], load * B[:, 2]
+    whole[_EXOGENOUS, _EXOGENOUS] = -np.diag(rates)
     moved = expm(whole * dt)
     F_d, B_d = moved[:STATES, :STATES], moved[:STATES, STATES:]
-    seen = np.zeros((2, STATES))
-    seen[0, :PLANT], seen[1, 2], seen[1, PLANT + 1 :] = C, 1.0, -1.0
-    walks = np.array([1e-9, noise.height, *[noise.temperature] * 3])
+    seen = np.zeros((len(_SEEN), STATES))
+    seen[np.ix_([0, 2], _PLANT)], seen[1, 2], seen[1, 6:8] = C, 1.0, -1.0
+    walks = np.array([1e-9, noise.height, *[noise.temperature] * 3, 0.0, 0.0, 0.0, noise.mass])
     sizes = np.array([noise.fluctuation, noise.drift, noise.recipe])
-    Q = np.diag([*walks**2 * dt, *sizes**2 * (1.0 - np.exp(-2.0 * rates * dt))])
-    R = np.diag([noise.ring**2, noise.pyrometer**2])
-    P = _solve(F_d.T, seen.T, Q, R, 1.0 / _SIZES[:STATES], 1.0 / np.array([MM, 1.0]))
+    Q = np.diag(walks**2 * dt)
+    Q[_EXOGENOUS, _EXOGENOUS] = np.diag(sizes**2 * (1.0 - np.exp(-2.0 * rates * dt)))
+    R = np.diag([noise.ring**2, noise.pyrometer**2, noise.weight**2])
+    P = _solve(F_d.T, seen.T, Q, R, 1.0 / _SIZES[:STATES], 1.0 / _SEEN)
     S: Floats = np.asarray(np.linalg.inv(seen @ P @ seen.T + R), np.float64)
-    return F_d, B_d, seen, P @ seen.T @ S, _regulator(F_d, B_d, weights), S
+    F = np.zeros((DRIVES, STATES + DRIVES))
+    acts = [*range(REGULATED), *range(STATES, STATES + DRIVES)]
+    F[:, acts] = _regulator(F_d[:REGULATED, :REGULATED], B_d[:REGULATED], weights)
+    return F_d, B_d, seen, P @ seen.T @ S, F, S
 
 
 def _regulator(A: Floats, B: Floats, weights: Weights) -> Floats:
-    """From states and last drives to drives: least mean cost of radius, drives and their steps."""
-    n = STATES + DRIVES
+    """From states, without the mass, and last drives to drives: least mean cost of radius, drives and their steps."""
+    n = REGULATED + DRIVES
     move, act, cost, cross = np.zeros((n, n)), np.zeros((n, DRIVES)), np.zeros((n, n)), np.zeros((n, DRIVES))
-    move[:STATES, :STATES], act[:STATES], act[STATES:] = A, B, np.eye(DRIVES)
+    move[:REGULATED, :REGULATED], act[:REGULATED], act[REGULATED:] = A, B, np.eye(DRIVES)
     cost[0, 0], cost[1, 1] = weights.radius**-2.0, weights.height**-2.0
     steps = np.diag([weights.pull_step**-2.0, weights.power_step**-2.0])
-    cost[STATES:, STATES:], cross[STATES:] = steps, -steps
+    cost[REGULATED:, REGULATED:], cross[REGULATED:] = steps, -steps
     drives = steps + np.diag([weights.pull**-2.0, weights.power**-2.0])
-    S = _solve(move, act, cost, drives, _SIZES, _SIZES[STATES:], cross)
+    sizes = np.delete(_SIZES, STATES - 1)
+    S = _solve(move, act, cost, drives, sizes, sizes[REGULATED:], cross)
     gain = np.linalg.solve(drives + act.T @ S @ act, act.T @ S @ move + cross.T)
     return np.asarray(-gain, np.float64)
 
@@ -143,7 +157,7 @@ class Memory(NamedTuple):
     """The memory of :class:`CrystalLQG`."""
 
     x: Floats
-    """Estimated states by each model, shape (n, models, 8)."""
+    """Estimated states by each model, shape (n, models, 9)."""
     evidence: Floats
     """Logarithm of how well each model has predicted, the best one's zero, shape (n, models)."""
 
@@ -169,12 +183,13 @@ class CrystalLQG(MeasuredController):
     def at_rest(self, seen: Any) -> Memory:
         """On the recipe, as far as the first sample tells; no model is better than the others."""
         x = np.zeros((len(seen.L), len(self.models), STATES))
-        x[:, :, STATES - 1] = (seen.T_1_ref - seen.T_1)[:, None]
+        x[:, :, REGULATED - 1] = (seen.T_1_ref - seen.T_1)[:, None]
         return Memory(x, np.zeros(x.shape[:2]))
 
     def step(self, seen: Any, memory: Memory) -> tuple[Floats, Floats, Memory]:
         """Pull speed and heater power above the recipe's, and the new memory."""
-        u, told = np.stack([seen.v_p, seen.Q_H], axis=1), np.stack([seen.ring_error, seen.T_1 - seen.T_1_ref], axis=1)
+        u = np.stack([seen.v_p, seen.Q_H], axis=1)
+        told = np.stack([seen.ring_error, seen.T_1 - seen.T_1_ref, seen.weight], axis=1)
         states, drives = np.empty_like(memory.x), np.empty((*memory.x.shape[:2], DRIVES))
         evidence = memory.evidence * math.exp(-self.control_interval / self.forgets)
         for number, lam in enumerate(self.models):

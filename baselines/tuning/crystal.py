@@ -6,7 +6,7 @@ the ring misleads most.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from .record import Goal, Parameter
 from .scaling import scaled
-from .values import by_scenario, with_values
+from .values import by_scenario, for_puller, with_values
 
 STAGES = {"crown": 0.6, "body": 0.2, "tail": 0.2}
 """Shares of the stages among the crystals of a search."""
@@ -59,6 +59,8 @@ DESIGN = (
     Parameter("noise.height", 1e-6, 1e-3),
     Parameter("noise.cones", 0.3, 10.0),
     Parameter("noise.recipe", 0.1, 30.0),
+    Parameter("noise.weight", 0.05, 5.0),
+    Parameter("noise.mass", 1e-6, 1e-2),
     Parameter("weights.height", 0.03 * MM, 3.0 * MM),
     Parameter("weights.cones", 0.1, 3.0),
     Parameter("weights.pull", 0.01 * MM_PER_MIN, 3.0 * MM_PER_MIN),
@@ -116,6 +118,9 @@ def in_proportion(settings: Any, config: Config) -> Any:
 class TunedCrystal:
     """A tuned controller of whole crystals: its start, the numbers that were searched, its row in tables."""
 
+    per_parameter: ClassVar[int] = 4
+    """Largest number of candidates of a search for a puller, for each parameter."""
+
     name: str
     meaning: str
     start: CrystalPID | CrystalLQG
@@ -124,14 +129,25 @@ class TunedCrystal:
     quoted: bool = False
 
     @property
+    def settings(self) -> CrystalPID | CrystalLQG:
+        """The controller with its tuned settings, on the default puller."""
+        settings: CrystalPID | CrystalLQG = with_values(self.start, by_scenario(self.name).get(RANDOMIZED.name, {}))
+        return settings
+
+    @property
     def goal(self) -> Goal:
-        """The goal of its search."""
-        return Goal(self.start, self.parameters, (), priced, (), FAILURE_PRICE, 0.0, CrystalFigures)
+        """The goal of its search, which begins with the settings that ship."""
+        return Goal(self.settings, self.parameters, (), priced, (), FAILURE_PRICE, 0.0, CrystalFigures)
+
+    def goal_on(self, config: Config) -> Goal:
+        """The goal of its search for the puller of an environment, near the settings in proportion."""
+        start = in_proportion(self.settings, config)
+        return replace(self.goal, start=start, parameters=tuple(each.near(start) for each in self.parameters))
 
     def make(self, config: Config) -> CrystalPID | CrystalLQG:
-        """The controller for an environment, with the settings that were chosen."""
-        chosen = by_scenario(self.name).get(RANDOMIZED.name, {})
-        settings: CrystalPID | CrystalLQG = in_proportion(with_values(self.start, chosen), config)
+        """The controller for an environment, with the settings that were chosen for its puller, or in proportion."""
+        chosen = for_puller(self.name, config.puller)
+        settings: CrystalPID | CrystalLQG = with_values(in_proportion(self.settings, config), chosen)
         return settings
 
     @property
@@ -162,6 +178,8 @@ CRYSTALS = (
         start=CrystalLQG(
             noise=Noise(
                 ring=0.08 * MM,
+                weight=0.8,
+                mass=5e-4,
                 height=1.5e-5,
                 cones=2.0,
                 temperature=2e-3,

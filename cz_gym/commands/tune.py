@@ -1,12 +1,14 @@
 """``cz-gym tune``: search the settings of controllers, on a scenario or for a puller of the user's own.
 
 For a puller its PIDs and the filter of its LQGs are searched from their scaled settings, side by side, half of the
-crystals on hot zones that are not the file's. Choices and histories are stored in a folder beside the file.
+crystals on hot zones that are not the file's; with ``--env CzCrystal-v0`` the controllers of whole crystals.
+Choices and histories are stored in a folder beside the file.
 """
 
 import argparse
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from cz_gym.baselines.tuning import crystal
@@ -14,10 +16,10 @@ from cz_gym.baselines.tuning.crystal import CRYSTALS, SCENARIOS, STAGES, TunedCr
 from cz_gym.baselines.tuning.lqg import LQGS
 from cz_gym.baselines.tuning.pid import PIDS
 from cz_gym.baselines.tuning.record import Tuned
-from cz_gym.baselines.tuning.search import Search, Trial, measure
+from cz_gym.baselines.tuning.search import Measure, Search, Trial, measure
 from cz_gym.baselines.tuning.values import file_name, folder_of
 from cz_gym.config import Config, make_config
-from cz_gym.crystal.process import CRYSTAL
+from cz_gym.crystal.process import CRYSTAL, ENVIRONMENTS
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.errors import CzError
 from cz_gym.evaluation.processes import side_by_side
@@ -26,8 +28,11 @@ from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.names import unknown
 
 _ALL: tuple[Tuned | TunedCrystal, ...] = (*PIDS, *LQGS, *CRYSTALS)
+CZ = "Cz-v0"
 TUNABLE = {each.name: each for each in _ALL}
-Task = tuple[Tuned, PullerFile, int, int, Path]
+EPISODES = {CZ: 20, CRYSTAL.name: 60}
+"""Training episodes of a candidate for a puller, by environment: of whole crystals three in five are crowns."""
+Task = tuple[Tuned | TunedCrystal, PullerFile, int, int, Path]
 """A search for a puller: controller, puller, candidates, episodes and folder."""
 
 
@@ -42,7 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_puller("design for it: a controller of its own for each row, minutes of work")
     about = "candidates to try, those of an earlier run included (100; with --puller at most 10 to 48)"
     add("--trials", type=between(1, 100_000), help=about)
-    add("--episodes", type=between(5, 5000), help="training episodes of a candidate (100; with --puller 20)")
+    add("--episodes", type=between(5, 5000), help="episodes a candidate (100; with --puller 20, whole crystals 60)")
+    add("--env", choices=ENVIRONMENTS, default=CZ, help=f"with --puller: whose controllers to search (default: {CZ})")
     add("--out", type=Path, help="folder of histories and choices (runs/tuning; with --puller beside its file)")
     return parser.run(_tune, arguments, "benchmark", "the same command continues from the candidates in its history")
 
@@ -76,14 +82,18 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
     """Search for a puller, several controllers side by side, and print what was chosen."""
     from tqdm import tqdm
 
-    searched = {each.name: each for each in (*LQGS, *PIDS) if each.searched_on_puller}
-    if given.controller not in (None, *searched):
-        raise CzError(unknown("controller to tune for a puller", given.controller, searched))
-    config, folder = crystals_on(puller), (given.out or folder_of(puller)).absolute()
+    known = {each.name: each for each in _ALL if isinstance(each, TunedCrystal) or each.searched_on_puller}
+    if given.controller not in (None, *known):
+        raise CzError(unknown("controller to tune for a puller", given.controller, known))
+    named = [known[given.controller]] if given.controller else []
+    crystals = given.env == CRYSTAL.name or isinstance((named or [None])[0], TunedCrystal)
+    searched = named or [each for each in known.values() if isinstance(each, TunedCrystal) == crystals]
+    folder = (given.out or folder_of(puller)).absolute()
     tasks: list[Task] = []
-    for each in [searched[given.controller]] if given.controller else searched.values():
+    for each in searched:
+        config, _ = crystals_on(each, puller)
         trials = given.trials or each.per_parameter * len(each.goal_on(config).parameters)
-        tasks.append((each, puller, trials, given.episodes or 20, folder))
+        tasks.append((each, puller, trials, given.episodes or EPISODES[config.process.name], folder))
     with tqdm(total=sum(task[2] for task in tasks), unit="candidate", dynamic_ncols=True, disable=None) as bar:
 
         def look() -> None:
@@ -92,23 +102,33 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
         for number, chosen in side_by_side(search_for, tasks, look, given.cluster, folder):
             look()
             figures = chosen.facts["figures"]
-            said = f"RMSE {figures['rmse_mm']:.3f} mm, {100 * figures['failure_rate']:.0f} % lost"
-            bar.write(f"{tasks[number][0].name}: {said} on validation crystals, half of them with other hot zones")
-    print(f"wrote {folder}: cz-gym benchmark --puller {puller.file or puller.name} runs what was designed")
+            if crystals:
+                said = f"crown's largest errors {figures['crown_mm']:.2f} mm, tail's {figures['tail_mm']:.2f} mm"
+                among = "half of them hard"
+            else:
+                said, among = f"RMSE {figures['rmse_mm']:.3f} mm", "half of them with other hot zones"
+            lost = f"{100 * figures['failure_rate']:.0f} % lost"
+            bar.write(f"{tasks[number][0].name}: {said}, {lost} on validation crystals, {among}")
+    command = f"cz-gym benchmark --puller {puller.file or puller.name}"
+    print(f"wrote {folder}: {command}{f' --env {CRYSTAL.name}' if crystals else ''} runs what was designed")
 
 
 def search_for(task: Task) -> Trial:
     """One search for a puller."""
     tuned, puller, trials, episodes, folder = task
-    config = crystals_on(puller)
-    search = Search(tuned.name, tuned.goal_on(config), config, trials, episodes, measure, True)
+    config, measures = crystals_on(tuned, puller)
+    search = Search(tuned.name, tuned.goal_on(config), config, trials, episodes, measures, True)
     return search.tune(folder / f"{tuned.name}.json")
 
 
-def crystals_on(puller: PullerFile) -> Config:
-    """The crystals that controllers are designed on for a puller: half of them with other hot zones."""
+def crystals_on(tuned: Tuned | TunedCrystal, puller: PullerFile) -> tuple[Config, Measure]:
+    """The crystals that a controller is designed on for a puller, half of them with other hot zones or ``hard``, and
+    what measures it there."""
+    if isinstance(tuned, TunedCrystal):
+        whole = partial(make_config, process=CRYSTAL, stage=STAGES)
+        return whole(SCENARIOS, None, "measured", action="direct", puller=puller), crystal.measure
     mixed = {"randomized": 0.5, "hot-zone": 0.5}
-    return make_config(mixed, None, "measured", action="direct", puller=puller)
+    return make_config(mixed, None, "measured", action="direct", puller=puller), measure
 
 
 def tried(path: Path) -> int:

@@ -20,11 +20,14 @@ from . import recipe
 from .parameters import APART
 from .plant import NO_DISTURBANCE, State, rates
 from .process import CRYSTAL, nominal_recipe
+from .signals import weight
 from .task import end
 
 Floats = npt.NDArray[np.float64]
-STATES = State._fields[:5]
-"""Rows and columns of A: what changes within minutes; area, mass and dopant are the recipe's."""
+STATES = (*State._fields[:5], "M_s")
+"""Rows and columns of A: what changes within minutes, and the mass, which a load cell weighs; area and dopant are the
+recipe's."""
+_ROWS = [State._fields.index(name) for name in STATES]
 INPUTS = (*Inputs._fields, "Q_d", "dT_i")
 """Columns of B."""
 _POINTS = 256
@@ -35,11 +38,11 @@ class Along(NamedTuple):
 
     L: Floats
     A: Floats
-    """Shape (points, 5, 5)."""
+    """Shape (points, 6, 6)."""
     B: Floats
-    """Shape (points, 5, 4)."""
+    """Shape (points, 6, 4)."""
     C: Floats
-    """The bright ring by the states, shape (points, 5)."""
+    """The bright ring [m] and the load cell [N] by the states, shape (points, 2, 6)."""
     load: float
     """Heat load on the melt that comes with a kelvin of drift, which the recipe that is given follows [W/K]."""
 
@@ -51,12 +54,12 @@ class Along(NamedTuple):
     @property
     def c_h(self) -> Floats:
         """The ring by the height [-]."""
-        return self.C[:, 1]
+        return self.C[:, 0, 1]
 
     @property
     def zero(self) -> Floats:
         """Zero from pull speed to ring at constant temperature [rad/s]: the inverse response where it is positive."""
-        rate: Floats = self.A[:, 0, 0] - self.C[:, 0] * self.A[:, 0, 1] / self.C[:, 1]
+        rate: Floats = self.A[:, 0, 0] - self.C[:, 0, 0] * self.A[:, 0, 1] / self.c_h
         return rate
 
 
@@ -77,12 +80,11 @@ def _at(L: float, table: Floats, p: Any, m: MeniscusModel) -> tuple[Floats, Floa
     x = State(*map(float, recipe.state_at(L, table, p, Episode())))
     u = Inputs(*(float(recipe.look_up(table, row, share, at)) for at in (recipe._v_p, recipe._Q_H)))
 
-    def ring(x: Any, u: Any, d: Any) -> Any:
-        return (x.r_c + m.ring_offset(x.r_c, x.h_c, p),)
+    def seen(x: Any, u: Any, d: Any) -> Any:
+        return x.r_c + m.ring_offset(x.r_c, x.h_c, p), weight(x, 0.0, p)
 
-    model = linearise(CRYSTAL, p, m, (x, u, NO_DISTURBANCE), INPUTS[2:], ring)
-    moves, n, length = np.array(rates(x, u, NO_DISTURBANCE, p, m)), len(STATES), State._fields.index("L")
-    drift = moves[:n] / moves[length]
-    A = model.A[:n, :n] - np.outer(drift, model.A[length, :n])
-    B = model.B[:n] - np.outer(drift, model.B[length])
-    return A, B, model.C[0, :n]
+    model = linearise(CRYSTAL, p, m, (x, u, NO_DISTURBANCE), INPUTS[2:], seen)
+    moves, length = np.array(rates(x, u, NO_DISTURBANCE, p, m)), State._fields.index("L")
+    drift = moves / moves[length]
+    A, B = model.A - np.outer(drift, model.A[length]), model.B - np.outer(drift, model.B[length])
+    return A[np.ix_(_ROWS, _ROWS)], B[_ROWS], model.C[:, _ROWS]

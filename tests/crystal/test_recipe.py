@@ -10,7 +10,9 @@ from cz_gym.commands import recipe as command
 from cz_gym.config import make_config
 from cz_gym.crystal.linearisation import along
 from cz_gym.crystal.process import CRYSTAL, nominal_recipe
+from cz_gym.crystal.shape import growth_rate, shape_at
 from cz_gym.crystal_env import CzCrystalEnv
+from cz_gym.episodes.record import Episode
 from cz_gym.errors import CzError
 from cz_gym.machine.puller import DEFAULT, PullerFile, find_puller, from_toml
 from cz_gym.physics.meniscus import HURLE
@@ -120,4 +122,8 @@ def test_the_linearisation_along_the_recipe():
     np.testing.assert_allclose(at.zero[[crown, body]], [0.0034, 0.0227], rtol=0.02)
     assert at.zero[tail] < 0.0
     np.testing.assert_allclose(at.c_h[[crown, body, tail]], [1.99, 0.225, -0.215], atol=0.01)
-    assert find_puller("germanium").recipe.M_0 == 30.0
+    p, _ = nominal_recipe(make_config(process=CRYSTAL).parameters, HURLE)
+    r, v_g = shape_at(at.L[crown], p, Episode()).r, growth_rate(at.L[crown], p)
+    by_radius = 2.0 * np.pi * p.rho_s * r * v_g  # against length a wide crystal gains mass, a fast one none
+    np.testing.assert_allclose(at.A[crown, 5], [by_radius, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-4 * by_radius)
+    assert at.C[crown, 1, 5] == p.g
