@@ -1,19 +1,22 @@
 """Stock learners on the environment as it comes: ``python -m studies.stock`` trains those of stable-baselines3.
 
-Each is judged on validation crystals of ``randomized`` after one million steps and after two, with each training seed.
-Runs that ``--out`` holds are not trained again.
+Each is judged on validation crystals of ``randomized`` after half of its actions and after all, with each training
+seed. Runs that ``--out`` holds are not trained again.
 """
 
 import argparse
 import csv
 import io
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import torch
-from stable_baselines3 import PPO
+from sb3_contrib import TQC, RecurrentPPO
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from cz_gym.agents.export import to_agent
@@ -28,26 +31,55 @@ from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.names import unknown
 
 MILLION = 1_000_000
-"""Steps after which a learner is judged, and again after as many."""
 
 
 class Learner(NamedTuple):
-    """stable-baselines3's PPO on its defaults, but for what a user would set."""
+    """A learner on its defaults, but for what a user would set."""
 
+    words: str
+    """Name in tables."""
     crystals: int
     """Number of crystals at a time."""
-    normalised: bool
+    algorithm: type[BaseAlgorithm] = PPO
+    policy: str = "MlpPolicy"
+    observation: str = "history"
+    action_repeat: int = 1
+    """Environment steps that an action is held for in training."""
+    normalised: bool = False
     """Whether ``VecNormalize``, on its defaults, is around the environment."""
-    learning_rate: float = 3e-4
+    actions: int = 2 * MILLION
+    """Actions that it learns from; it is judged after half of them and after all."""
+    settings: Mapping[str, Any] = MappingProxyType({})
+    """Arguments of the algorithm."""
 
 
+_sparing = {"gradient_steps": 4, "ent_coef": "auto_0.005", "target_entropy": 0.5}
 LEARNERS = {
-    "ppo, 8 crystals": Learner(8, normalised=False),
-    "ppo, 8 crystals, VecNormalize": Learner(8, normalised=True),
-    "ppo, 8 crystals, VecNormalize, smaller steps": Learner(8, normalised=True, learning_rate=3e-5),
-    "ppo, 16 crystals, VecNormalize": Learner(16, normalised=True),
-}
-HEADS = ("learner", "steps", "training seeds", "RMSE of each seed [mm]", "lost of each seed [%]")
+    "ppo-8": Learner("ppo, 8 crystals", 8),
+    "ppo-8-normalised": Learner("ppo, 8 crystals, VecNormalize", 8, normalised=True),
+    "ppo-8-normalised-slow": Learner(
+        "ppo, 8 crystals, VecNormalize, smaller steps", 8, normalised=True, settings={"learning_rate": 3e-5}
+    ),
+    "ppo-16-normalised": Learner("ppo, 16 crystals, VecNormalize", 16, normalised=True),
+    "recurrent-8": Learner(
+        "recurrent ppo on measured, 8 crystals", 8, RecurrentPPO, "MlpLstmPolicy", "measured", actions=MILLION // 2
+    ),
+    "recurrent-64": Learner(
+        "recurrent ppo on measured, 64 crystals, actions held 20 s", 64, RecurrentPPO, "MlpLstmPolicy", "measured", 4,
+        actions=MILLION, settings={"n_steps": 64, "batch_size": 1024},
+    ),
+    "sac-8": Learner("sac, 8 crystals", 8, SAC, actions=MILLION // 2),
+    "sac-64": Learner(
+        "sac, 64 crystals, actions held 20 s, little entropy", 64, SAC, action_repeat=4, actions=MILLION,
+        settings=_sparing,
+    ),
+    "tqc-8": Learner("tqc, 8 crystals", 8, TQC, actions=MILLION // 2),
+    "tqc-64": Learner(
+        "tqc, 64 crystals, actions held 20 s, little entropy", 64, TQC, action_repeat=4, actions=MILLION,
+        settings=_sparing,
+    ),
+}  # fmt: skip
+HEADS = ("learner", "actions", "training seeds", "RMSE of each seed [mm]", "lost of each seed [%]")
 COLUMNS = ("learner", "seed", "steps", "rmse_mm", "lost")
 ABOUT = """# Stock learners: stable-baselines3 on the environment as it comes
 
@@ -55,32 +87,34 @@ ABOUT = """# Stock learners: stable-baselines3 on the environment as it comes
 
 
 def train(name: str, seed: int) -> list[tuple[Any, ...]]:
-    """Rows of :data:`COLUMNS`: one learner, one training seed, at each million steps."""
+    """Rows of :data:`COLUMNS`: one learner, one training seed, after half of its actions and after all."""
     torch.set_num_threads(1)
-    learner, config = LEARNERS[name], make_config("randomized")
-    env = make_vec_env(learner.crystals)
+    learner = LEARNERS[name]
+    config = make_config("randomized", None, learner.observation)
+    env = make_vec_env(learner.crystals, None, learner.action_repeat, observation=learner.observation)
     env = VecNormalize(env) if learner.normalised else env
-    model = PPO("MlpPolicy", env, learner.learning_rate, seed=seed, device="cpu")
-    rows = list[tuple[Any, ...]]()
-    for steps in (MILLION, 2 * MILLION):
-        model.learn(MILLION, reset_num_timesteps=False)
+    model: Any = learner.algorithm(learner.policy, env, seed=seed, device="cpu", **learner.settings)
+    rows, half = list[tuple[Any, ...]](), learner.actions // 2
+    for actions in (half, 2 * half):
+        model.learn(half, reset_num_timesteps=False)
         agent = to_agent(model, "stock", seed, config, model.get_vec_normalize_env(), "stock.onnx")
         judged = validate(agent, config, JUDGING)
-        rows.append((name, seed, steps, f"{judged.rmse_mm:.4f}", f"{judged.failure_rate:.4f}"))
+        rows.append((learner.words, seed, actions, f"{judged.rmse_mm:.4f}", f"{judged.failure_rate:.4f}"))
     return rows
 
 
 def report(rows: Sequence[Sequence[str]]) -> str:
     """The table of all runs."""
     groups = dict[tuple[str, str], list[Sequence[str]]]()
-    for row in sorted(rows, key=lambda row: (list(LEARNERS).index(row[0]), int(row[2]), int(row[1]))):
+    order = [each.words for each in LEARNERS.values()]
+    for row in sorted(rows, key=lambda row: (order.index(row[0]), int(row[2]), int(row[1]))):
         groups.setdefault((row[0], row[2]), []).append(row)
     config = make_config("randomized", None, "measured", action="direct")
     pid = validate(make_controller("paper-tuned", config), config, JUDGING).rmse_mm
     table = [
-        (name, f"{int(steps) / MILLION:g} M", str(len(of)), " / ".join(f"{float(row[3]):.3f}" for row in of),
+        (words, f"{int(steps) / MILLION:g} M", str(len(of)), " / ".join(f"{float(row[3]):.3f}" for row in of),
          " / ".join(f"{100.0 * float(row[4]):.1f}" for row in of))
-        for (name, steps), of in groups.items()
+        for (words, steps), of in groups.items()
     ]  # fmt: skip
     return "\n\n".join([ABOUT.format(crystals=len(JUDGING), pid=pid), markdown(HEADS, table)])
 
@@ -88,7 +122,7 @@ def report(rows: Sequence[Sequence[str]]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser(prog="python -m studies.stock", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("learners", nargs="*", metavar="LEARNER", help=f"of: {'; '.join(LEARNERS)} (default: all)")
+    parser.add_argument("learners", nargs="*", metavar="LEARNER", help=f"of: {', '.join(LEARNERS)} (default: all)")
     parser.add_argument(
         "--seeds", type=between(1, 100), default=3, help="training seeds of each (default: %(default)s)"
     )
@@ -102,10 +136,13 @@ def _main(given: argparse.Namespace) -> None:
             raise CzError(unknown("learner", name, LEARNERS))
     runs, table = given.out / "runs.csv", given.out / "table.md"
     rows = list(csv.reader(runs.read_text().splitlines()))[1:] if runs.exists() else []
+    known = {each.words for each in LEARNERS.values()}
+    if any(len(row) != len(COLUMNS) or row[0] not in known for row in rows):
+        raise CzError(f"{runs}: no runs of this study, or damaged")
     done = {(row[0], row[1]) for row in rows}
     for seed in range(given.seeds):
         for name in given.learners or LEARNERS:
-            if (name, str(seed)) not in done:
+            if (LEARNERS[name].words, str(seed)) not in done:
                 rows += [list(map(str, row)) for row in train(name, seed)]
                 text = io.StringIO()
                 csv.writer(text, lineterminator="\n").writerows([COLUMNS, *rows])
