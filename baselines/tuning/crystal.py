@@ -104,13 +104,22 @@ def priced(figures: CrystalFigures) -> float:
 
 
 def in_proportion(settings: Any, config: Config) -> Any:
-    """The settings for the default puller, in proportion to the puller of an environment."""
+    """The settings for the default puller, in proportion to the puller of an environment.
+
+    Regulators ignore the limits of drives. A step that a drive's slew rate does not allow must be dear, as they would
+    swing between the limits otherwise.
+    """
     if isinstance(settings, CrystalPID):
         return scaled(settings, config)
-    own, given = config.ranges, settings.weights
+    own, given, dt = config.ranges, settings.weights, config.control_interval
     pull, power = own[0] / PULL_SCALE, own[1] / HEATER_SCALE
-    sizes = {"pull": pull, "pull_step": pull, "power": power, "power_step": power}
-    weights = given._replace(**{name: factor * getattr(given, name) for name, factor in sizes.items()})
+    drives = [each.actuators for each in config.scenario.scenarios]
+    weights = given._replace(
+        pull=pull * given.pull,
+        pull_step=min(pull * given.pull_step, *(dt * each.pull_slew for each in drives)),
+        power=power * given.power,
+        power_step=min(power * given.power_step, *(dt * each.heater_slew for each in drives)),
+    )
     return replace(settings, weights=weights).for_config(config)
 
 

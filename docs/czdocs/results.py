@@ -18,6 +18,8 @@ OBSERVABLE = ("sensor-fault", "puller")
 STEP = "pull_step_rms_mm_per_min"
 PIDS = ("paper", "paper-filtered", "paper-tuned", "pid-conventional", "industrial")
 LQGS = ("lqg", "lqg-quiet", "lqg-at-0.02", "lqg-at-0.02-adaptive")
+CRYSTALS = ("ring-pid-reduced", "compensated", "lqg-along", "true-radius")
+PULLERS = ("silicon-300mm", "germanium")
 BOUNDS = ("lqg", "lqg-quiet", "lqg-true", "full-information", "clairvoyant")
 BUDGETS = tuple(f"{name}-{budget}M" for budget in (1, 5, 20) for name in ("ppo-plain", "ppo"))
 MEMBERS = ("0.005", "0.008", "0.013", "0.02", "0.03")
@@ -101,11 +103,24 @@ def frontier() -> Lines:
     return table(("", *(code(f"lqg-at-{size}") for size in MEMBERS)), rows)
 
 
-def searches(prefix: str) -> Lines:
+def on_pullers() -> Lines:
+    """Whole crystals of other pullers: lost ones of each stage, and the crown's largest error."""
+    rows = []
+    for puller in PULLERS:
+        of = run(f"crystal-{puller}")["results"]
+        for stage in of:
+            lost = (of[stage][each]["failure_rate"]["mean"] for each in CRYSTALS)
+            rows.append((f"{puller}: {stage}, lost [%]", *(f"{100.0 * share:.0f}" for share in lost)))
+        errors = (of["crown"][each]["crown_max_mm"]["mean"] for each in CRYSTALS)
+        rows.append((f"{puller}: largest error of the crown, mean [mm]", *(f"{error:.2f}" for error in errors)))
+    return table(("", *map(code, CRYSTALS)), rows)
+
+
+def searches(*controllers: str) -> Lines:
     """Budgets of the searches whose records ship: candidates and training crystals."""
     rows: dict[tuple[str, str, str], list[str]] = {}
-    for path in sorted(RECORDS.glob(f"{prefix}*.json")):
-        found = record(path.stem)
+    names = (path.stem for path in sorted(RECORDS.glob("*.json")) if path.name.startswith(controllers))
+    for found in map(record, names):
         budget = (found["scenario"], str(found["budget"]["trials"]), str(found["budget"]["episodes"]))
         rows.setdefault(budget, []).append(code(found["controller"]))
     lines = ((", ".join(names), *budget) for budget, names in sorted(rows.items()))
@@ -163,9 +178,11 @@ TABLES: dict[str, Callable[[], Lines]] = {
     "machines": partial(copied, "other_machine/machines.txt"),
     "ratios": equal,
     "frontier": frontier,
-    "whole": partial(figures, "whole", ("compensated", "lqg-along", "gradient-along"), ("whole",), WHOLE),
+    "whole": partial(figures, "whole", ("compensated", "lqg-along", "ppo-along", "gradient-along"), ("whole",), WHOLE),
     "stock": partial(copied, "stock/table.md"),
-    "searches-lqg": partial(searches, "lqg"),
-    "searches-pid": partial(searches, "[!l]"),
+    "on-pullers": on_pullers,
+    "searches-crystal": partial(searches, "compensated", "lqg-along", "ring-pid-reduced"),
+    "searches-lqg": partial(searches, "lqg-at", "lqg-quiet", "lqg.", "lqg-puller", "lqg-sensor"),
+    "searches-pid": partial(searches, *PIDS),
 }
 """Every table, by the name a page asks for it with."""
