@@ -91,7 +91,10 @@ class PlantFilter(NamedTuple):
         return state._replace(mean=self._clipped(mean), covariance=covariance)
 
     def correct(self, state: FilterState, seen: Measured) -> FilterState:
-        """The state after the pyrometer where it is finite, and the camera where its frame is valid."""
+        """The state after the pyrometer where it is finite, and the camera where its frame is valid.
+
+        ``seen.valid`` is the frame's weight: 1/3 in each of three samples that have one frame in common.
+        """
         noise, gate = self.noise, self.gate
         row = np.zeros_like(state.mean)
         row[:, _PYROMETER] = 1.0
@@ -101,14 +104,14 @@ class PlantFilter(NamedTuple):
         warmth = innovation / np.sqrt(kalman.expected_variance(state.covariance, row) + noise.pyrometer_sd**2)
         mean, covariance = kalman.correct(state.mean, state.covariance, row, innovation, variance, gate)
         ring, row = self.expected_frame(mean)
-        innovation, valid = seen.ring_error + seen.r_ref - ring, seen.valid > 0.5
+        innovation, valid = seen.ring_error + seen.r_ref - ring, seen.valid > 0.0
         expected = kalman.expected_variance(covariance, row)
         keep = 1.0 - self.dt / (noise.camera_memory + self.dt)
         least, most = noise.camera_sd_range
         camera_variance = kalman.matched_variance(
             state.camera_variance, innovation, expected, valid, keep, (least**2, most**2), gate
         )
-        variance = np.where(valid, state.camera_variance, np.inf)
+        variance = np.where(valid, state.camera_variance / np.where(valid, seen.valid, 1.0), np.inf)
         corrected, covariance = kalman.correct(mean, covariance, row, innovation, variance, gate)
         width = np.where(valid, innovation, 0.0) / np.sqrt(expected + state.camera_variance)
         newest = np.clip(np.stack([warmth, width], axis=-1), -gate, gate)

@@ -93,7 +93,7 @@ class MultipleModelFilter(NamedTuple):
         ring, row = self.rows.expected_frame(state.mean)
         variance = np.einsum("ri,rij,rj->r", row, state.covariance, row) + state.camera_variance
         square = np.minimum(np.square(seen.ring_error + seen.r_ref - ring) / variance, self.rows.gate**2)
-        return np.where(seen.valid > 0.5, -0.5 * (square + np.log(variance)), 0.0)
+        return np.where(seen.valid > 0.0, -0.5 * seen.valid * (square + np.log(variance)), 0.0)
 
 
 def multiple_model_filter(single: PlantFilter, hypotheses: Hypotheses, n: int) -> MultipleModelFilter:

@@ -51,6 +51,8 @@ class Memory(NamedTuple):
     """Time of the last call that took one [s]."""
     late: Any
     """1 if that call was late."""
+    samples: Any
+    """Number of samples of that call."""
     engaged: Any
     """1 if the last sample was automatic."""
     since: Any
@@ -96,6 +98,8 @@ class Call(NamedTuple):
     """Whether one went before in this call."""
     share: Any
     """1 over the number of samples that are left with this one."""
+    samples: Any
+    """Number of samples of the call."""
     starts: Any
     """Whether this is the first call, or the first after a gap."""
     late: Any
@@ -117,8 +121,9 @@ def call_of(dt: float, given: Any, memory: Memory) -> Call:
     due = finite(time) & (behind >= 0.5 * dt)
     again = due & (behind >= 1.5 * dt)
     left = 1.0 + np.where(again, 1.0, 0.0) + np.where(behind >= 2.5 * dt, 1.0, 0.0)
+    samples = np.where(later, memory.samples, left)
     sound = finite(time) & ~back & (~begun | (time > memory.called_s) | (later & due))
-    return Call(due, again, later, 1.0 / left, ~begun | gap, late, sound, time - behind + dt)
+    return Call(due, again, later, 1.0 / left, samples, ~begun | gap, late, sound, time - behind + dt)
 
 
 class Readings(NamedTuple):

@@ -88,9 +88,10 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
     read = trimmed(seen.read, off_T_1, off_Q_H)
     nominal = drives[0].nominal, drives[1].nominal + off_Q_H / KILO
     estimates = controller.accepts_missing_temperature
-    told = read._replace(T_1=np.where(call.again, np.inf, seen.T_1 - off_T_1)) if estimates else read
+    # The samples of a call have one frame in common, whose noise counts once.
+    told = read._replace(T_1=np.where(call.again, np.inf, seen.T_1 - off_T_1), valid=read.valid / call.samples)
     held = memory.controller if runs.all() else select(runs, memory.controller, controller.at_rest(read))
-    own = controller.step(told, held)
+    own = controller.step(told if estimates else read, held)
     other = own[0], own[1], memory.pid
     if (fallback | ~(finite(own[0]) & finite(own[1]))).any():
         other = pid.step(read, select(fallen, memory.pid, pid.at_rest(read)))
@@ -126,7 +127,7 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
     outputs = dict(zip((port.name for port in OUTPUTS), (*setpoints, alarms), strict=True))
     now = Memory(
         clock_s=call.clock, called_s=given["time_s"], late=np.where(call.late, 1.0, 0.0),
-        engaged=np.where(engaged, 1.0, 0.0), since=since, bad=bad,
+        samples=call.samples, engaged=np.where(engaged, 1.0, 0.0), since=since, bad=bad,
         fallback=np.where(fallback | (engaged & ~sound), 1.0, 0.0), pull=setpoints[0], heater=setpoints[1],
         astray=astray, shown=seen.shown, still=seen.still, dark=dark, level=level, calm=calm, off_T_1=off_T_1,
         off_Q_H=off_Q_H, readings=seen.read, controller=own[2], pid=other[2],

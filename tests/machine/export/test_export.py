@@ -391,7 +391,20 @@ def test_the_samples_of_a_late_call_see_ring_and_drives_on_their_way():
     thirds = np.array([1.0, 2.0, 3.0])
     assert np.array(told[-3:])[:, :3] == pytest.approx(np.outer(thirds, [1e-4, 0.02 / 6e4, 100.0]), abs=1e-9)
     assert np.isfinite(told)[-3:, 3].tolist() == [False, False, True]
-    assert all(each[4] == 1.0 for each in told)
+    assert [each[4] for each in told] == pytest.approx([1.0] * 3 + [1.0 / 3.0] * 3)
+
+
+def test_an_lqg_knows_less_of_the_radius_when_it_is_called_late():
+    """The samples of one call have one frame in common: its noise counts once."""
+    block = block_of("lqg-at-0.02")
+
+    def variance(pace):
+        memory = block.start(1)
+        for time in np.arange(0.0, 600.0, pace):
+            _, memory = block.run(nominal({"time_s": time, "ring_time_s": time}), memory)
+        return memory.controller.filter.covariance[0, 0, 0]
+
+    assert variance(15.0) > 1.2 * variance(5.0)
 
 
 def test_a_bad_ring_is_held_then_the_pid_takes_over_until_the_next_takeover():
