@@ -14,6 +14,7 @@ from cz_gym.baselines.crystal.lqg import CrystalLQG, Noise, Weights
 from cz_gym.baselines.crystal.pid import CrystalPID, TrueRadiusPID
 from cz_gym.baselines.pid.compensated_pid import SeriesPID
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
+from cz_gym.body.plant import make_puller
 from cz_gym.config import Config
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.evaluation.contender import Contender
@@ -23,7 +24,7 @@ from cz_gym.process import HEATER_SCALE, PULL_SCALE
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from .record import Goal, Parameter
-from .scaling import scaled
+from .scaling import parameters_of, scaled
 from .values import by_scenario, for_puller, with_values
 
 STAGES = {"crown": 0.6, "body": 0.2, "tail": 0.2}
@@ -106,21 +107,26 @@ def priced(figures: CrystalFigures) -> float:
 def in_proportion(settings: Any, config: Config) -> Any:
     """The settings for the default puller, in proportion to the puller of an environment.
 
-    Regulators ignore the limits of drives. A step that a drive's slew rate does not allow must be dear, as they would
-    swing between the limits otherwise.
+    An LQG's weights follow the ranges of the drives and the meniscus height, the height's walk the growth rate that a
+    kelvin makes. Regulators ignore the limits of drives: a step that a slew rate does not allow must be dear, as they
+    would swing between the limits otherwise.
     """
     if isinstance(settings, CrystalPID):
         return scaled(settings, config)
     own, given, dt = config.ranges, settings.weights, config.control_interval
+    here, default = make_puller(parameters_of(config)), make_puller()
+    grows = [each.k_l / (each.rho_dH * each.h_0) for each in (here, default)]
+    noise = settings.noise._replace(height=grows[0] / grows[1] * settings.noise.height)
     pull, power = own[0] / PULL_SCALE, own[1] / HEATER_SCALE
     drives = [each.actuators for each in config.scenario.scenarios]
     weights = given._replace(
+        height=here.h_0 / default.h_0 * given.height,
         pull=pull * given.pull,
         pull_step=min(pull * given.pull_step, *(dt * each.pull_slew for each in drives)),
         power=power * given.power,
         power_step=min(power * given.power_step, *(dt * each.heater_slew for each in drives)),
     )
-    return replace(settings, weights=weights).for_config(config)
+    return replace(settings, noise=noise, weights=weights).for_config(config)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -39,7 +39,7 @@ def factors(config: Config) -> dict[str, float]:
     capacity; the melt temperature that changes growth by v_0.
     """
     default, own = radius_model(make_puller()), model_of(config)
-    time, pullers = default.zero / own.zero, [make_puller(each) for each in (_of(config), DEFAULT.parameters)]
+    time, pullers = default.zero / own.zero, [make_puller(each) for each in (parameters_of(config), DEFAULT.parameters)]
     trims = [p.v_0 * p.rho_dH * p.h_0 / p.k_l for p in pullers]
     gains = [design_compensator(model, CUT_OFF / slower).gain for model, slower in ((own, time), (default, 1.0))]
     return {
@@ -55,10 +55,10 @@ def factors(config: Config) -> dict[str, float]:
 
 def model_of(config: Config) -> RadiusModel:
     """Model I of an environment's puller."""
-    return radius_model(make_puller(_of(config), 1.0, config.meniscus))
+    return radius_model(make_puller(parameters_of(config), 1.0, config.meniscus))
 
 
-def _of(config: Config) -> Parameters:
+def parameters_of(config: Config) -> Parameters:
     """The puller's own parameters, also where a whole crystal is grown."""
     own: Parameters = labelled(Parameters, config.parameters)
     return own
