@@ -45,8 +45,8 @@ class Learner(NamedTuple):
     observation: str = "history"
     action_repeat: int = 1
     """Environment steps that an action is held for in training."""
-    normalised: bool = False
-    """Whether ``VecNormalize``, on its defaults, is around the environment."""
+    normalised: Mapping[str, Any] | None = None
+    """Arguments of the ``VecNormalize`` around the environment; None for none."""
     actions: int = 2 * MILLION
     """Actions that it learns from; it is judged after half of them and after all."""
     settings: Mapping[str, Any] = MappingProxyType({})
@@ -56,11 +56,12 @@ class Learner(NamedTuple):
 _sparing = {"gradient_steps": 4, "ent_coef": "auto_0.005", "target_entropy": 0.5}
 LEARNERS = {
     "ppo-8": Learner("ppo, 8 crystals", 8),
-    "ppo-8-normalised": Learner("ppo, 8 crystals, VecNormalize", 8, normalised=True),
+    "ppo-8-normalised": Learner("ppo, 8 crystals, VecNormalize", 8, normalised={}),
+    "ppo-8-rewards": Learner("ppo, 8 crystals, VecNormalize of rewards alone", 8, normalised={"norm_obs": False}),
     "ppo-8-normalised-slow": Learner(
-        "ppo, 8 crystals, VecNormalize, smaller steps", 8, normalised=True, settings={"learning_rate": 3e-5}
+        "ppo, 8 crystals, VecNormalize, smaller steps", 8, normalised={}, settings={"learning_rate": 3e-5}
     ),
-    "ppo-16-normalised": Learner("ppo, 16 crystals, VecNormalize", 16, normalised=True),
+    "ppo-16-normalised": Learner("ppo, 16 crystals, VecNormalize", 16, normalised={}),
     "recurrent-8": Learner(
         "recurrent ppo on measured, 8 crystals", 8, RecurrentPPO, "MlpLstmPolicy", "measured", actions=MILLION // 2
     ),
@@ -92,7 +93,7 @@ def train(name: str, seed: int) -> list[tuple[Any, ...]]:
     learner = LEARNERS[name]
     config = make_config("randomized", None, learner.observation)
     env = make_vec_env(learner.crystals, None, learner.action_repeat, observation=learner.observation)
-    env = VecNormalize(env) if learner.normalised else env
+    env = env if learner.normalised is None else VecNormalize(env, **learner.normalised)
     model: Any = learner.algorithm(learner.policy, env, seed=seed, device="cpu", **learner.settings)
     rows, half = list[tuple[Any, ...]](), learner.actions // 2
     for actions in (half, 2 * half):
