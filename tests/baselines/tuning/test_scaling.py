@@ -12,12 +12,15 @@ from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.analysis.sampled_loop import close
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.registry import find_controller, make_controller
+from cz_gym.baselines.tuning import crystal
+from cz_gym.baselines.tuning.crystal import CRYSTALS, CrystalFigures
 from cz_gym.baselines.tuning.pid import PAPER_TUNED, PIDS, paper_here
-from cz_gym.baselines.tuning.record import Figures
+from cz_gym.baselines.tuning.record import Figures, value_at
 from cz_gym.baselines.tuning.scaling import scaled
 from cz_gym.commands import tune
 from cz_gym.commands.benchmark import main as benchmark
 from cz_gym.config import make_config
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
@@ -117,6 +120,26 @@ def test_one_command_designs_and_another_runs_it(tmp_path, monkeypatch, capsys):
     assert written["provenance"]["control_interval_s"] == 2.0
     assert "puller silicon-300mm (" in (out / "report.md").read_text()
     assert tune.main(["--puller", str(place), "--controller", "lqg"]) == 2
+
+
+def test_whole_crystals_of_a_puller_have_searches_of_their_own(tmp_path, monkeypatch, capsys):
+    place = tmp_path / "mine.toml"
+    write_puller(find_puller("silicon-300mm"), place)
+
+    def figures(policy, config, seeds):
+        return CrystalFigures(policy.control_interval, 0.5, 0.1, 0.01, 0.02)
+
+    monkeypatch.setattr(crystal, "measure", figures)
+    monkeypatch.setattr(tune, "side_by_side", lambda function, tasks, *_: enumerate(map(function, tasks)))
+    assert tune.main(["--puller", str(place), "--trials", "14", "--env", "CzCrystal-v0"]) == 0
+    assert "crown's largest errors 2.00 mm, tail's 0.50 mm, 2 % lost" in capsys.readouterr().out
+    assert {path.stem for path in (tmp_path / "mine").iterdir()} == {each.name for each in CRYSTALS}
+    config = make_config(puller=find_puller(place), process=CRYSTAL, **PLAIN)
+    for each in CRYSTALS:
+        chosen = json.loads((tmp_path / "mine" / f"{each.name}.json").read_text())["chosen"]["values"]
+        assert chosen == {path: value_at(each.make(config), path) for path in chosen}
+    assert tune.main(["--puller", str(place), "--controller", "lqg-along", "--trials", "14"]) == 0
+    assert "benchmark --puller" in capsys.readouterr().out
 
 
 def test_agents_and_controllers_for_another_puller_are_refused_by_its_name():
