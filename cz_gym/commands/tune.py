@@ -60,9 +60,10 @@ def _tune(given: argparse.Namespace) -> None:
         raise CzError("--cluster shares the searches for a --puller between machines: one search is one task")
     if given.controller is None:
         raise CzError("name a --controller, or a --puller to design for")
-    scenario, tuned = find_scenario(given.scenario), TUNABLE.get(given.controller)
+    scenario, known = find_scenario(given.scenario), tunable(given)
+    tuned = known.get(given.controller)
     if tuned is None:
-        raise CzError(unknown("controller to tune", given.controller, TUNABLE))
+        raise CzError(unknown("controller to tune", given.controller, known))
     trials, episodes, interval = given.trials or 100, given.episodes or 100, given.control_interval
     if isinstance(tuned, TunedCrystal):
         if scenario != RANDOMIZED:
@@ -78,16 +79,21 @@ def _tune(given: argparse.Namespace) -> None:
     return None
 
 
+def tunable(given: argparse.Namespace) -> dict[str, Tuned | TunedCrystal]:
+    """The controllers that may be named: with ``--env CzCrystal-v0`` those of whole crystals alone."""
+    return {name: each for name, each in TUNABLE.items() if given.env == CZ or isinstance(each, TunedCrystal)}
+
+
 def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
     """Search for a puller, several controllers side by side, and print what was chosen."""
     from tqdm import tqdm
 
-    known = {each.name: each for each in _ALL if isinstance(each, TunedCrystal) or each.searched_on_puller}
+    known = {name: each for name, each in tunable(given).items() if getattr(each, "searched_on_puller", True)}
     if given.controller not in (None, *known):
         raise CzError(unknown("controller to tune for a puller", given.controller, known))
-    named = [known[given.controller]] if given.controller else []
-    crystals = given.env == CRYSTAL.name or isinstance((named or [None])[0], TunedCrystal)
-    searched = named or [each for each in known.values() if isinstance(each, TunedCrystal) == crystals]
+    alike = [each for each in known.values() if isinstance(each, TunedCrystal) == (given.env != CZ)]
+    searched = [known[given.controller]] if given.controller else alike
+    crystals = isinstance(searched[0], TunedCrystal)
     folder = (given.out or folder_of(puller)).absolute()
     tasks: list[Task] = []
     for each in searched:

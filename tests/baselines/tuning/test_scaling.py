@@ -140,6 +140,9 @@ def test_whole_crystals_of_a_puller_have_searches_of_their_own(tmp_path, monkeyp
         assert chosen == {path: value_at(each.make(config), path) for path in chosen}
     assert tune.main(["--puller", str(place), "--controller", "lqg-along", "--trials", "14"]) == 0
     assert "benchmark --puller" in capsys.readouterr().out
+    for where in (["--puller", str(place)], []):
+        assert tune.main([*where, "--controller", "paper-tuned", "--env", "CzCrystal-v0"]) == 2
+        assert "unknown controller to tune" in capsys.readouterr().err
 
 
 def test_agents_and_controllers_for_another_puller_are_refused_by_its_name():
