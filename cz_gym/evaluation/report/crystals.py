@@ -12,7 +12,7 @@ from cz_gym.evaluation.results import SPEED, Result
 from cz_gym.evaluation.rollout import Floats
 from cz_gym.support.units import KILO, MM, MM_PER_MIN, PERCENT
 
-from .canvas import INK, canvas, png, styles_of
+from .canvas import INK, canvas, chosen, png, styles_of
 from .crystal import example, lost
 from .tables import FAILURES, HEATER_STEP, NOTHING, PULL_STEP, RETURN, RMSE, Column, Verdict, label
 
@@ -115,7 +115,7 @@ POINTS = 2000
 
 def draw(result: Result) -> bytes:
     """Draw the first crystal of a stage under each controller: its profile to scale, and its signals by length."""
-    samples, style = result.samples[:MOST], styles_of(result.samples)
+    samples, style = chosen(result.samples, MOST), styles_of(result.samples)
     signals = {sample.name: _thinned(example(sample)) for sample in samples}
     longest = max(signals.values(), key=lambda s: s.L[-1])
     room = 1.1 * longest.r_ref.max() / MM
