@@ -99,7 +99,7 @@ CONTROLLERS: tuple[Contender, ...] = (
 )
 """Every named controller of ``Cz-v0``, in the order of tables."""
 CRYSTAL_CONTROLLERS: tuple[Contender, ...] = (
-    Contender("recipe", partial(unchanged, OpenLoop()), "measured", "the recipe's pull speed and power, no feedback"),
+    _measured("recipe", partial(unchanged, OpenLoop()), meaning="the recipe's pull speed and power, no feedback"),
     Contender("ring-pid", partial(in_proportion, RING_PID), "measured", "PID on the bright ring with the body's gains"),
     *(each.contender for each in CRYSTALS),
     Contender(
@@ -108,6 +108,7 @@ CRYSTAL_CONTROLLERS: tuple[Contender, ...] = (
         "state",
         "bound: the PID on the true radius, which no sensor shows",
         privileged=True,
+        on_puller=True,
     ),
 )
 """Every named controller of ``CzCrystal-v0``, in the order of tables."""

@@ -190,15 +190,17 @@ class CrystalLQG(MeasuredController):
         """Pull speed and heater power above the recipe's, and the new memory."""
         u = np.stack([seen.v_p, seen.Q_H], axis=1)
         told = np.stack([seen.ring_error, seen.T_1 - seen.T_1_ref, seen.weight], axis=1)
+        blind = seen.valid < 0.5
         states, drives = np.empty_like(memory.x), np.empty((*memory.x.shape[:2], DRIVES))
         evidence = memory.evidence * math.exp(-self.control_interval / self.forgets)
         for number, lam in enumerate(self.models):
             at = design(self.parameters, self.meniscus, self.control_interval, lam, self.noise, self.weights)
             near, share = _between(at.L, seen.L)
             A, B, C, K, F, S = (_mix(each, near, share) for each in at[1:])
+            K[blind], S[blind] = without_ring(K[blind], S[blind])
             x = _times(A, memory.x[:, number]) + _times(B, u)
             new = told - _times(C, x)
-            new[:, 0] = np.where(seen.valid > 0.5, np.clip(new[:, 0], -self.jump, self.jump), 0.0)
+            new[:, 0] = np.where(blind, 0.0, np.clip(new[:, 0], -self.jump, self.jump))
             evidence[:, number] += 0.5 * (np.log(np.linalg.det(S)) - np.sum(new * _times(S, new), axis=1))
             states[:, number] = x + _times(K, new)
             drives[:, number] = _times(F, np.concatenate([states[:, number], u], axis=1))
@@ -206,6 +208,15 @@ class CrystalLQG(MeasuredController):
         weights = np.exp(evidence)[:, :, None]
         acts = (weights * drives).sum(axis=1) / weights.sum(axis=1)
         return acts[:, 0], acts[:, 1], Memory(states, evidence)
+
+
+def without_ring(K: Floats, S: Floats) -> tuple[Floats, Floats]:
+    """Gains and inverse covariance where the ring is not seen: those of pyrometer and load cell alone."""
+    covariance, gain, known = np.linalg.inv(S), np.zeros_like(K), np.zeros_like(S)
+    known[:, 0, 0] = 1.0  # of an innovation that is zero
+    known[:, 1:, 1:] = np.linalg.inv(covariance[:, 1:, 1:])
+    gain[:, :, 1:] = (K @ covariance)[:, :, 1:] @ known[:, 1:, 1:]
+    return gain, known
 
 
 def _between(L: Floats, at: Floats) -> tuple[Any, Floats]:

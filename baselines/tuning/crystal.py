@@ -16,6 +16,7 @@ from cz_gym.baselines.pid.compensated_pid import SeriesPID
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
 from cz_gym.body.plant import make_puller
 from cz_gym.config import Config
+from cz_gym.crystal.task import CONE_LIMIT
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.evaluation.contender import Contender
 from cz_gym.evaluation.crystal_metrics import Floats, crystal_metrics
@@ -88,13 +89,16 @@ def measure(policy: Any, config: Config, seeds: Sequence[int]) -> CrystalFigures
     """Run a controller on those crystals; figures have six digits, as in the history."""
     m = crystal_metrics(rollout(policy, config, seeds))
     inside, steps = np.nanmean(m.body_within_half), m.pull_step_rms_mm_per_min.mean()
-    values = _worst(m.crown_max_mm), _worst(m.tail_max_mm), 1.0 - inside, steps, m.failure_rate.mean()
+    largest = CONE_LIMIT * config.radius_limit / MM
+    values = _worst(m.crown_max_mm, largest), _worst(m.tail_max_mm, largest), 1.0 - inside, steps, m.failure_rate.mean()
     return CrystalFigures._make(float(f"{value:.6g}") for value in values)
 
 
-def _worst(errors: Floats) -> float:
-    """Mean of the largest errors [mm]."""
+def _worst(errors: Floats, largest: float) -> float:
+    """Mean of the largest errors [mm]; the largest that is allowed where no crystal got there."""
     known = np.sort(errors[~np.isnan(errors)])
+    if not len(known):
+        return largest
     return float(known[-max(round(WORST * len(known)), 1) :].mean())
 
 
@@ -168,7 +172,7 @@ class TunedCrystal:
     @property
     def contender(self) -> Contender:
         """The controller as a row of the benchmark."""
-        return Contender(self.name, self.make, "measured", self.meaning, quoted=self.quoted)
+        return Contender(self.name, self.make, "measured", self.meaning, quoted=self.quoted, on_puller=True)
 
 
 RING_PID = CrystalPID(pid=CONVENTIONAL, compensates=False, T_f=10.0, heater=HEATER)
@@ -189,7 +193,7 @@ CRYSTALS = (
     ),
     TunedCrystal(
         name="lqg-along",
-        meaning="Kalman filter and regulator designed along the recipe",
+        meaning="Kalman filters of ring, pyrometer and load cell, and regulators, designed along the recipe",
         start=CrystalLQG(
             noise=Noise(
                 ring=0.08 * MM,

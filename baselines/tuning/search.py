@@ -170,14 +170,15 @@ class Search:
         try:
             with naming(path):
                 file = json.loads(path.read_text("utf-8"))
-            if file["parameters"] != self._paths:
-                raise CzError(f"its parameters are not those of {self.controller}")
-            if file.get("puller", DEFAULT.label) != self.config.puller.label:
-                raise CzError(f"it is of puller {file['puller']}: remove it to begin anew")
+            parameters, puller = file["parameters"], file.get("puller", DEFAULT.label)
             self.trials = [Trial(tuple(values), score, facts) for values, score, facts in file["history"]]
             episodes = file["budget"]["episodes"]
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise CzError(f"{path} is no history of this search: {error!r}") from None
+        if parameters != self._paths:
+            raise CzError(f"{path}: its parameters are not those of {self.controller}: remove it to begin anew")
+        if puller != self.config.puller.label:
+            raise CzError(f"{path}: found for puller {puller}: remove it to begin anew")
         if episodes != self.budget["episodes"]:
             raise CzError(f"{path} was begun with {episodes} episodes; ask for as many, or write another file")
 

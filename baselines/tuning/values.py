@@ -76,9 +76,11 @@ def for_puller(controller: str, puller: PullerFile) -> Mapping[str, float]:
         return {}
     try:
         search = json.loads(path.read_text("utf-8"))
-        values: dict[str, float] = search.get("chosen", {"values": {}})["values"]
-        label = search["puller"]
-    except (KeyError, TypeError, ValueError):
+        values = {name: float(value) for name, value in search.get("chosen", {"values": {}})["values"].items()}
+        label, known = search["puller"], search.get("parameters", list(values))
+        if not all(map(math.isfinite, values.values())) or not values.keys() <= set(known):
+            raise ValueError
+    except (AttributeError, KeyError, TypeError, ValueError):
         raise CzError(f"{path}: no choice of a search, or damaged") from None
     if label != puller.label:
         raise CzError(f"{path}: found for puller {label}, not for {puller.label}: tune again")

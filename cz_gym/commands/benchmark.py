@@ -184,6 +184,8 @@ def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Co
     files = {name: shipped_seeds(name) for name in shipped if name in wanted and name not in given}
     chosen += [*given.values(), *(agent(name, [*map(OnnxPolicy.load, some)]) for name, some in files.items())]
     check_agents(chosen, rows)
+    if not (chosen or own):
+        raise CzError("no controller takes part: name some with --controllers")
     return [*chosen, *own]
 
 

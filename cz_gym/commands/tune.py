@@ -138,5 +138,8 @@ def crystals_on(tuned: Tuned | TunedCrystal, puller: PullerFile) -> tuple[Config
 
 
 def tried(path: Path) -> int:
-    """Number of candidates in a history."""
-    return len(json.loads(path.read_text("utf-8"))["history"]) if path.exists() else 0
+    """Number of candidates in a history; none in a damaged one, which the search refuses."""
+    try:
+        return len(json.loads(path.read_text("utf-8"))["history"]) if path.exists() else 0
+    except (KeyError, TypeError, ValueError):
+        return 0

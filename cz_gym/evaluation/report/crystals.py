@@ -75,10 +75,11 @@ def verdict(results: Sequence[Result], column: Column = RMSE) -> Verdict:
 
     best = min(able, key=place)
     lost_of = (f"{_plain(FAILURES, result, best)} % of {result.row.name}" for result in results)
-    return Verdict(
-        f"{best} loses the fewest crystals, {', '.join(lost_of)}; 95 % of its crowns are at most "
-        f"{_plain(CROWN_95, crown, best)} mm off, and {_plain(BODY, body, best)} % of the body is within 0.5 mm."
-    )
+    crowns, bodies = _plain(CROWN_95, crown, best), _plain(BODY, body, best)
+    said = [f"{best} loses the fewest crystals, {', '.join(lost_of)}"]
+    said += [f"95 % of its crowns are at most {crowns} mm off"] if crowns != NOTHING else []
+    said += [f"{bodies} % of the body is within 0.5 mm"] if bodies != NOTHING else []
+    return Verdict(f"{'; '.join(said)}.")
 
 
 def losses(result: Result) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:

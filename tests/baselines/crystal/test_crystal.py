@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cz_gym.baselines.crystal.lqg import STATES, Noise, Weights, design
+from cz_gym.baselines.crystal.lqg import STATES, Noise, Weights, design, without_ring
 from cz_gym.baselines.registry import CRYSTAL_CONTROLLERS, make_controller
 from cz_gym.baselines.tuning.crystal import CRYSTALS
 from cz_gym.baselines.tuning.values import by_scenario, with_values
@@ -77,6 +77,23 @@ def test_filter_and_regulator_are_stable_at_every_length():
         assert not F[:, STATES - 1].any()
         acts = np.delete(np.arange(STATES + 2), STATES - 1)
         assert max(np.abs(np.linalg.eigvals(part)).max() for part in (told @ A, loop[np.ix_(acts, acts)])) < 1.0
+
+
+def test_without_the_ring_the_other_sensors_have_gains_of_their_own():
+    """Those of a filter with the same covariance of the state that never had a camera."""
+    at = design(make_config(process=CRYSTAL).parameters, HURLE, 5.0, 0.5, Noise(), Weights())
+    gain, known = without_ring(at.K, at.S)
+    covariance = np.linalg.inv(at.S)
+    PC = at.K @ covariance
+    for row in (0, 100, 255):
+        expected = PC[row][:, 1:] @ np.linalg.inv(covariance[row, 1:, 1:])
+        np.testing.assert_allclose(gain[row], np.column_stack([np.zeros(STATES), expected]), rtol=1e-9, atol=1e-18)
+        assert np.linalg.slogdet(known[row])[1] == pytest.approx(-np.linalg.slogdet(covariance[row, 1:, 1:])[1])
+
+
+def test_who_runs_on_a_puller_unless_controllers_are_named():
+    runs = [each.name for each in CRYSTAL_CONTROLLERS if each.on_puller]
+    assert runs == ["ring-pid-reduced", "compensated", "lqg-along", "true-radius"]
 
 
 def test_controllers_are_made_for_one_process():

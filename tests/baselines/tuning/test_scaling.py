@@ -95,9 +95,11 @@ def test_what_was_found_is_used_for_that_puller_alone(tmp_path):
     kept.write_text(json.dumps({"puller": "other (0)", "chosen": {"values": {}}}))
     with pytest.raises(CzError, match=r"found for puller other \(0\), not for silicon-300mm"):
         make_controller("paper-tuned", config)
-    kept.write_text("{}")
-    with pytest.raises(CzError, match="or damaged"):
-        make_controller("paper-tuned", config)
+    head = {"puller": puller.label, "parameters": ["T_f"]}
+    for damaged in ({}, [], {**head, "chosen": {"values": {"T_f": "abc"}}}, {**head, "chosen": {"values": {"T": 1.0}}}):
+        kept.write_text(json.dumps(damaged))
+        with pytest.raises(CzError, match="or damaged"):
+            make_controller("paper-tuned", config)
 
 
 def test_one_command_designs_and_another_runs_it(tmp_path, monkeypatch, capsys):
@@ -140,6 +142,10 @@ def test_whole_crystals_of_a_puller_have_searches_of_their_own(tmp_path, monkeyp
         assert chosen == {path: value_at(each.make(config), path) for path in chosen}
     assert tune.main(["--puller", str(place), "--controller", "lqg-along", "--trials", "14"]) == 0
     assert "benchmark --puller" in capsys.readouterr().out
+    for damaged in ("{", "[]", '{"puller": "x"}'):
+        (tmp_path / "mine" / "lqg-along.json").write_text(damaged)
+        assert tune.main(["--puller", str(place), "--controller", "lqg-along"]) == 2
+        assert "no history of this search" in capsys.readouterr().err
     for where in (["--puller", str(place)], []):
         assert tune.main([*where, "--controller", "paper-tuned", "--env", "CzCrystal-v0"]) == 2
         assert "unknown controller to tune" in capsys.readouterr().err
