@@ -147,7 +147,8 @@ def _main(given: argparse.Namespace) -> None:
                 rows += [list(map(str, row)) for row in train(name, seed)]
                 text = io.StringIO()
                 csv.writer(text, lineterminator="\n").writerows([COLUMNS, *rows])
-                write_files({runs: text.getvalue().encode(), table: f"{report(rows)}\n".encode()})
+                write_files({runs: text.getvalue().encode()})
+    write_files({table: f"{report(rows)}\n".encode()})
     print(table.read_text())
 
 

@@ -155,8 +155,8 @@ class TunedCrystal:
 
     @property
     def goal(self) -> Goal:
-        """The goal of its search, which begins with the settings that ship."""
-        return Goal(self.settings, self.parameters, (), priced, (), FAILURE_PRICE, 0.0, CrystalFigures)
+        """The goal of its search."""
+        return Goal(self.start, self.parameters, (), priced, (), FAILURE_PRICE, 0.0, CrystalFigures)
 
     def goal_on(self, config: Config) -> Goal:
         """The goal of its search for the puller of an environment, near the settings in proportion."""
@@ -196,18 +196,20 @@ CRYSTALS = (
         meaning="Kalman filters of ring, pyrometer and load cell, and regulators, designed along the recipe",
         start=CrystalLQG(
             noise=Noise(
-                ring=0.08 * MM,
+                ring=8.073e-5,
                 weight=0.8,
-                mass=5e-4,
-                height=1.5e-5,
-                cones=2.0,
+                height=2.738e-5,
+                cones=1.389,
                 temperature=2e-3,
+                mass=5e-4,
                 fluctuation=0.3,
                 tau=600.0,
                 drift=5.0,
-                recipe=6.0,
+                recipe=4.503,
             ),
-            weights=Weights(radius=0.4 * MM, height=0.3 * MM, cones=0.3, pull=0.1 * MM_PER_MIN, power_step=1.6 * KILO),
+            weights=Weights(
+                radius=0.4 * MM, height=6.531e-4, cones=0.2566, pull=1.527e-6, power=6488.0, power_step=2646.0
+            ),
         ),
         parameters=DESIGN,
         quoted=True,

@@ -41,8 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = OneLineParser("cz-gym tune", "Tune a controller within a budget.")
     add = parser.add_argument
     add("--controller", help=f"{', '.join(TUNABLE)} (with --puller: all that are searched for one)")
-    add("--scenario", default="randomized", help="scenario to tune on")
-    add("--control-interval", type=float, default=5.0, help="time between actions [s]")
+    add("--scenario", help=f"scenario to tune on ({RANDOMIZED.name})")
+    add("--control-interval", type=float, help="time between actions [s] (5)")
     parser.add_cluster()
     parser.add_puller("design for it: a controller of its own for each row, minutes of work")
     about = "candidates to try, those of an earlier run included (100; with --puller at most 10 to 48)"
@@ -55,26 +55,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _tune(given: argparse.Namespace) -> None:
     if given.puller is not None:
+        if given.scenario or given.control_interval:
+            raise CzError("a search for a --puller has scenarios and interval of its own: leave both options out")
         return for_puller(given, chosen_puller(given.puller))
     if given.cluster:
         raise CzError("--cluster shares the searches for a --puller between machines: one search is one task")
     if given.controller is None:
         raise CzError("name a --controller, or a --puller to design for")
-    scenario, known = find_scenario(given.scenario), tunable(given)
+    name, known = given.scenario or RANDOMIZED.name, tunable(given)
+    scenario = find_scenario(name)
     tuned = known.get(given.controller)
     if tuned is None:
         raise CzError(unknown("controller to tune", given.controller, known))
-    trials, episodes, interval = given.trials or 100, given.episodes or 100, given.control_interval
+    trials, episodes, interval = given.trials or 100, given.episodes or 100, given.control_interval or 5.0
     if isinstance(tuned, TunedCrystal):
         if scenario != RANDOMIZED:
-            raise CzError(f"{tuned.name} has one search: leave --scenario {given.scenario} out")
+            raise CzError(f"{tuned.name} has one search: leave --scenario {name} out")
         config = make_config(SCENARIOS, None, "measured", interval, action="direct", process=CRYSTAL, stage=STAGES)
         search = Search(tuned.name, tuned.goal, config, trials, episodes, crystal.measure)
     else:
         config = make_config(tuned.crystals(scenario), None, "measured", interval, action="direct")
         search = Search(tuned.name, tuned.goal(scenario), config, trials, episodes, measure)
-    chosen = search.tune((given.out or Path("runs/tuning")) / file_name(tuned.name, given.scenario))
-    print(f"{tuned.name} on {given.scenario}: {chosen.score:.4f} {chosen.facts}")
+    chosen = search.tune((given.out or Path("runs/tuning")) / file_name(tuned.name, name))
+    print(f"{tuned.name} on {name}: {chosen.score:.4f} {chosen.facts}")
     print(search.settings(chosen.values))
     return None
 

@@ -122,6 +122,8 @@ def test_one_command_designs_and_another_runs_it(tmp_path, monkeypatch, capsys):
     assert written["provenance"]["control_interval_s"] == 2.0
     assert "puller silicon-300mm (" in (out / "report.md").read_text()
     assert tune.main(["--puller", str(place), "--controller", "lqg"]) == 2
+    assert tune.main(["--puller", str(place), "--scenario", "hard"]) == 2
+    assert "leave both options out" in capsys.readouterr().err
 
 
 def test_whole_crystals_of_a_puller_have_searches_of_their_own(tmp_path, monkeypatch, capsys):
