@@ -133,10 +133,10 @@ def rows_of(path: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if not line.startswith("|-")]
 
 
-def copied(path: str) -> Lines:
-    """A committed table as it stands."""
-    head, *rows = rows_of(path)
-    return table(head, rows)
+def copied(*paths: str) -> Lines:
+    """Committed tables with the same heads, one below the other."""
+    head = rows_of(paths[0])[0]
+    return table(head, [row for path in paths for row in rows_of(path)[1:]])
 
 
 def faults() -> Lines:
@@ -180,6 +180,7 @@ TABLES: dict[str, Callable[[], Lines]] = {
     "frontier": frontier,
     "whole": partial(figures, "whole", ("compensated", "lqg-along", "ppo-along", "gradient-along"), ("whole",), WHOLE),
     "stock": partial(copied, "stock/table.md"),
+    "offline": partial(copied, "offline/lqg-mixed.txt", "offline/operator-paper.txt"),
     "on-pullers": on_pullers,
     "searches-crystal": partial(searches, "compensated", "lqg-along", "ring-pid-reduced"),
     "searches-lqg": partial(searches, "lqg-at", "lqg-quiet", "lqg.", "lqg-puller", "lqg-sensor"),
