@@ -99,7 +99,7 @@ CONTROLLERS: tuple[Contender, ...] = (
 )
 """Every named controller of ``Cz-v0``, in the order of tables."""
 CRYSTAL_CONTROLLERS: tuple[Contender, ...] = (
-    _measured("recipe", partial(unchanged, OpenLoop()), meaning="the recipe's pull speed and power, no feedback"),
+    Contender("recipe", partial(unchanged, OpenLoop()), "measured", "the recipe's pull speed and power, no feedback"),
     Contender("ring-pid", partial(in_proportion, RING_PID), "measured", "PID on the bright ring with the body's gains"),
     *(each.contender for each in CRYSTALS),
     Contender(

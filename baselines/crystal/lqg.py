@@ -27,7 +27,9 @@ from .pid import in_cones
 REGULATED, STATES, DRIVES = 8, 9, 2
 """r_c, h_c, T_1, T_2, T_b, then the fluctuation, the drift and the recipe's error [K], then the crystal's mass [kg],
 which is estimated and not regulated."""
-_PLANT, _EXOGENOUS = [0, 1, 2, 3, 4, 8], slice(5, 8)
+_T_1, _FLUCTUATION, _DRIFT, _MASS = 2, 5, 6, 8
+_PLANT, _EXOGENOUS = [0, 1, 2, 3, 4, _MASS], slice(_FLUCTUATION, _MASS)
+"""The states that are the plant's, in the order of its linearisation, and those that are not."""
 _SIZES = np.array([MM, MM, *[1.0] * 6, 0.1, MM_PER_MIN, KILO])
 """Sizes of the states and the drives, in SI units."""
 _SEEN = np.array([MM, 1.0, 1.0])
@@ -109,12 +111,12 @@ def _at(A: Floats, B: Floats, C: Floats, load: float, dt: float, noise: Noise, w
     rates = 1.0 / np.array([noise.tau, noise.slow, noise.slow])
     whole = np.zeros((STATES + DRIVES, STATES + DRIVES))
     whole[np.ix_(_PLANT, _PLANT)], whole[_PLANT, STATES:] = A, B[:, :DRIVES]
-    whole[_PLANT, 5], whole[_PLANT, 6] = B[:, 3], load * B[:, 2]
+    whole[_PLANT, _FLUCTUATION], whole[_PLANT, _DRIFT] = B[:, 3], load * B[:, 2]
     whole[_EXOGENOUS, _EXOGENOUS] = -np.diag(rates)
     moved = expm(whole * dt)
     F_d, B_d = moved[:STATES, :STATES], moved[:STATES, STATES:]
     seen = np.zeros((len(_SEEN), STATES))
-    seen[np.ix_([0, 2], _PLANT)], seen[1, 2], seen[1, 6:8] = C, 1.0, -1.0
+    seen[np.ix_([0, 2], _PLANT)], seen[1, _T_1], seen[1, _DRIFT:_MASS] = C, 1.0, -1.0
     walks = np.array([1e-9, noise.height, *[noise.temperature] * 3, 0.0, 0.0, 0.0, noise.mass])
     sizes = np.array([noise.fluctuation, noise.drift, noise.recipe])
     Q = np.diag(walks**2 * dt)
@@ -137,7 +139,7 @@ def _regulator(A: Floats, B: Floats, weights: Weights) -> Floats:
     steps = np.diag([weights.pull_step**-2.0, weights.power_step**-2.0])
     cost[REGULATED:, REGULATED:], cross[REGULATED:] = steps, -steps
     drives = steps + np.diag([weights.pull**-2.0, weights.power**-2.0])
-    sizes = np.delete(_SIZES, STATES - 1)
+    sizes = np.delete(_SIZES, _MASS)
     S = _solve(move, act, cost, drives, sizes, sizes[REGULATED:], cross)
     gain = np.linalg.solve(drives + act.T @ S @ act, act.T @ S @ move + cross.T)
     return np.asarray(-gain, np.float64)
