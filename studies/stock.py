@@ -7,25 +7,19 @@ seed. Runs that ``--out`` holds are not trained again.
 import argparse
 import csv
 import io
+import pkgutil
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import torch
-from sb3_contrib import TQC, RecurrentPPO
-from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecNormalize
-
-from cz_gym.agents.export import to_agent
+from cz_gym.agents.from_sb3 import ALGORITHMS
 from cz_gym.agents.training.validation import JUDGING, validate
 from cz_gym.baselines.registry import make_controller
 from cz_gym.config import make_config
 from cz_gym.errors import CzError
 from cz_gym.evaluation.report.tables import markdown
-from cz_gym.sb3 import make_vec_env
 from cz_gym.support.atomic_files import write_files
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.names import unknown
@@ -40,7 +34,8 @@ class Learner(NamedTuple):
     """Name in tables."""
     crystals: int
     """Number of crystals at a time."""
-    algorithm: type[BaseAlgorithm] = PPO
+    algorithm: str = "ppo"
+    """Name of ``ALGORITHMS``."""
     policy: str = "MlpPolicy"
     observation: str = "history"
     action_repeat: int = 1
@@ -62,21 +57,25 @@ LEARNERS = {
         "ppo, 8 crystals, VecNormalize, smaller steps", 8, normalised={}, settings={"learning_rate": 3e-5}
     ),
     "ppo-16-normalised": Learner("ppo, 16 crystals, VecNormalize", 16, normalised={}),
+    "ppo-8-held": Learner(
+        "ppo, 8 crystals, VecNormalize, actions held 20 s, less noise", 8, action_repeat=4, normalised={},
+        settings={"policy_kwargs": {"log_std_init": -1.0}},
+    ),
     "recurrent-8": Learner(
-        "recurrent ppo on measured, 8 crystals", 8, RecurrentPPO, "MlpLstmPolicy", "measured", actions=MILLION // 2
+        "recurrent ppo on measured, 8 crystals", 8, "ppo_lstm", "MlpLstmPolicy", "measured", actions=MILLION // 2
     ),
     "recurrent-64": Learner(
-        "recurrent ppo on measured, 64 crystals, actions held 20 s", 64, RecurrentPPO, "MlpLstmPolicy", "measured", 4,
+        "recurrent ppo on measured, 64 crystals, actions held 20 s", 64, "ppo_lstm", "MlpLstmPolicy", "measured", 4,
         actions=MILLION, settings={"n_steps": 64, "batch_size": 1024},
     ),
-    "sac-8": Learner("sac, 8 crystals", 8, SAC, actions=MILLION // 2),
+    "sac-8": Learner("sac, 8 crystals", 8, "sac", actions=MILLION // 2),
     "sac-64": Learner(
-        "sac, 64 crystals, actions held 20 s, little entropy", 64, SAC, action_repeat=4, actions=MILLION,
+        "sac, 64 crystals, actions held 20 s, little entropy", 64, "sac", action_repeat=4, actions=MILLION,
         settings=_sparing,
     ),
-    "tqc-8": Learner("tqc, 8 crystals", 8, TQC, actions=MILLION // 2),
+    "tqc-8": Learner("tqc, 8 crystals", 8, "tqc", actions=MILLION // 2),
     "tqc-64": Learner(
-        "tqc, 64 crystals, actions held 20 s, little entropy", 64, TQC, action_repeat=4, actions=MILLION,
+        "tqc, 64 crystals, actions held 20 s, little entropy", 64, "tqc", action_repeat=4, actions=MILLION,
         settings=_sparing,
     ),
 }  # fmt: skip
@@ -89,12 +88,19 @@ ABOUT = """# Stock learners: stable-baselines3 on the environment as it comes
 
 def train(name: str, seed: int) -> list[tuple[Any, ...]]:
     """Rows of :data:`COLUMNS`: one learner, one training seed, after half of its actions and after all."""
+    import torch
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from cz_gym.agents.export import to_agent
+    from cz_gym.sb3 import make_vec_env
+
     torch.set_num_threads(1)
     learner = LEARNERS[name]
     config = make_config("randomized", None, learner.observation)
     env = make_vec_env(learner.crystals, None, learner.action_repeat, observation=learner.observation)
     env = env if learner.normalised is None else VecNormalize(env, **learner.normalised)
-    model: Any = learner.algorithm(learner.policy, env, seed=seed, device="cpu", **learner.settings)
+    algorithm: Any = pkgutil.resolve_name(ALGORITHMS[learner.algorithm])
+    model = algorithm(learner.policy, env, seed=seed, device="cpu", **learner.settings)
     rows, half = list[tuple[Any, ...]](), learner.actions // 2
     for actions in (half, 2 * half):
         model.learn(half, reset_num_timesteps=False)

@@ -8,6 +8,7 @@ stopped again, measures none of them again, and continues.
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -64,6 +65,10 @@ def measure(policy: Any, config: Config, seeds: Sequence[int]) -> Figures:
     return Figures._make([*(float(f"{value:.6g}") for value in values), config.steps])
 
 
+class _Spent(Exception):
+    """The budget of candidates is spent; COBYLA itself knows none below its number of variables plus two."""
+
+
 class Search:
     """The search of a controller's settings in an environment."""
 
@@ -103,8 +108,10 @@ class Search:
 
         def tried(point: Floats) -> tuple[tuple[float, ...], Any]:
             values = tuple(p.value(x) for p, x in zip(goal.parameters, point, strict=True))
-            known = {trial.values: trial for trial in self.trials}
-            return values, goal.kind(**(known.get(values) or self.add(values)).facts["figures"])
+            trial = {trial.values: trial for trial in self.trials}.get(values)
+            if trial is None and len(self.trials) >= self.budget["trials"]:
+                raise _Spent
+            return values, goal.kind(**(trial or self.add(values)).facts["figures"])
 
         def objective(point: Floats) -> float:
             return goal.objective(tried(point)[1])
@@ -117,8 +124,10 @@ class Search:
         start = np.array([p.coordinate(value) for p, value in zip(goal.parameters, self.first, strict=True)])
         limits: Any = [NonlinearConstraint(distances, 0.0, np.inf)] if goal.limits else []
         last_step = QUICK_STEP if self.quick else 1e-3
-        options: Any = {"maxiter": self.budget["trials"], "rhobeg": FIRST_STEP, "tol": last_step}
-        minimize(objective, start, method="COBYLA", constraints=limits, options=options)
+        most = max(self.budget["trials"], len(start) + 2)
+        options: Any = {"maxiter": most, "rhobeg": FIRST_STEP, "tol": last_step}
+        with suppress(_Spent):
+            minimize(objective, start, method="COBYLA", constraints=limits, options=options)
 
     def add(self, values: tuple[float, ...]) -> Trial:
         """Score a candidate on training episodes; one that would be the best must also survive other scenarios."""

@@ -74,6 +74,15 @@ def test_every_trial_is_kept_at_once_and_a_search_continues_where_it_stopped(tmp
     assert len(met) == len(whole.trials) - len(begun.trials) + 3
 
 
+@pytest.mark.parametrize("trials", [1, 2, 3, 9])
+def test_no_more_candidates_are_tried_than_asked_for(trials, recwarn):
+    """SciPy raises COBYLA's number of evaluations to that of the parameters plus two, with a warning."""
+    search, met = bowl(trials)
+    search.explore()
+    assert len(search.trials) == len(met) == trials
+    assert not recwarn.list
+
+
 def test_another_file_is_refused(tmp_path):
     path = tmp_path / "bowl.json"
     bowl()[0].tune(path)
