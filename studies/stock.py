@@ -57,10 +57,8 @@ LEARNERS = {
         "ppo, 8 crystals, VecNormalize, smaller steps", 8, normalised={}, settings={"learning_rate": 3e-5}
     ),
     "ppo-16-normalised": Learner("ppo, 16 crystals, VecNormalize", 16, normalised={}),
-    "ppo-8-held": Learner(
-        "ppo, 8 crystals, VecNormalize, actions held 20 s, less noise", 8, action_repeat=4, normalised={},
-        settings={"policy_kwargs": {"log_std_init": -1.0}},
-    ),
+    "ppo-8-held": Learner("ppo, 8 crystals, VecNormalize, actions held 20 s", 8, action_repeat=4, normalised={}),
+    "ppo-16-held": Learner("ppo, 16 crystals, VecNormalize, actions held 20 s", 16, action_repeat=4, normalised={}),
     "recurrent-8": Learner(
         "recurrent ppo on measured, 8 crystals", 8, "ppo_lstm", "MlpLstmPolicy", "measured", actions=MILLION // 2
     ),

@@ -41,8 +41,10 @@ HEATER = TemperatureLoop(K=1500.0, T_i=300.0, K_pull=10.0, T_pull=2000.0, T_mean
 """The heater's loop on the recipe, trimmed where the mean pull speed is off the recipe's."""
 CONVENTIONAL = SeriesPID(K_p=0.0018, T_i=2000.0, T_d=1069.0, N=25.0)
 """Gains of ``pid-conventional`` of ``Cz-v0``, which needs no compensator, with a slower integrator."""
-COMPENSATED = SeriesPID(K_p=0.008, T_i=1500.0, T_d=800.0, N=12.0)
-"""Gains near those of the paper, with a slower derivative filter."""
+COMPENSATED = SeriesPID(K_p=0.003, T_i=1100.0, T_d=1500.0, N=13.0)
+"""A longer derivative than the paper's at a lower gain: from a wider search on training crystals of all stages."""
+TRIMMED = TemperatureLoop(K=2200.0, T_i=300.0, K_pull=21.0, T_pull=650.0, T_mean=630.0)
+"""The heater's loop with a quicker trim, from the same search."""
 LOOP = (
     Parameter("pid.K_p", 3e-4, 5e-2),
     Parameter("pid.T_i", 300.0, 3.0 * HOUR),
@@ -187,7 +189,7 @@ CRYSTALS = (
     TunedCrystal(
         name="compensated",
         meaning="PID on the ring less the height that the paper's compensator predicts along the recipe",
-        start=CrystalPID(pid=COMPENSATED, lam=0.1, slow=1.0e-3, cone_gain=0.15, heater=HEATER),
+        start=CrystalPID(pid=COMPENSATED, lam=0.0, slow=5.0e-4, cone_gain=0.2, T_f=20.0, heater=TRIMMED),
         parameters=(*LOOP, *COMPENSATOR),
         quoted=True,
     ),
