@@ -62,18 +62,9 @@ LEARNERS = {
     "recurrent-8": Learner(
         "recurrent ppo on measured, 8 crystals", 8, "ppo_lstm", "MlpLstmPolicy", "measured", actions=MILLION // 2
     ),
-    "recurrent-64": Learner(
-        "recurrent ppo on measured, 64 crystals, actions held 20 s", 64, "ppo_lstm", "MlpLstmPolicy", "measured", 4,
-        actions=MILLION, settings={"n_steps": 64, "batch_size": 1024},
-    ),
     "sac-8": Learner("sac, 8 crystals", 8, "sac", actions=MILLION // 2),
     "sac-64": Learner(
         "sac, 64 crystals, actions held 20 s, little entropy", 64, "sac", action_repeat=4, actions=MILLION,
-        settings=_sparing,
-    ),
-    "tqc-8": Learner("tqc, 8 crystals", 8, "tqc", actions=MILLION // 2),
-    "tqc-64": Learner(
-        "tqc, 64 crystals, actions held 20 s, little entropy", 64, "tqc", action_repeat=4, actions=MILLION,
         settings=_sparing,
     ),
 }  # fmt: skip
