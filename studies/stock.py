@@ -35,7 +35,7 @@ class Learner(NamedTuple):
     crystals: int
     """Number of crystals at a time."""
     algorithm: str = "ppo"
-    """Name of ``ALGORITHMS``."""
+    """Its name, as ``python -m cz_gym.agents.from_sb3 --algo`` knows it."""
     policy: str = "MlpPolicy"
     observation: str = "history"
     action_repeat: int = 1
@@ -48,7 +48,6 @@ class Learner(NamedTuple):
     """Arguments of the algorithm."""
 
 
-_sparing = {"gradient_steps": 4, "ent_coef": "auto_0.005", "target_entropy": 0.5}
 LEARNERS = {
     "ppo-8": Learner("ppo, 8 crystals", 8),
     "ppo-8-normalised": Learner("ppo, 8 crystals, VecNormalize", 8, normalised={}),
@@ -65,7 +64,7 @@ LEARNERS = {
     "sac-8": Learner("sac, 8 crystals", 8, "sac", actions=MILLION // 2),
     "sac-64": Learner(
         "sac, 64 crystals, actions held 20 s, little entropy", 64, "sac", action_repeat=4, actions=MILLION,
-        settings=_sparing,
+        settings={"gradient_steps": 4, "ent_coef": "auto_0.005", "target_entropy": 0.5},
     ),
 }  # fmt: skip
 HEADS = ("learner", "actions", "training seeds", "RMSE of each seed [mm]", "lost of each seed [%]")

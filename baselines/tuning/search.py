@@ -66,7 +66,7 @@ def measure(policy: Any, config: Config, seeds: Sequence[int]) -> Figures:
 
 
 class _Spent(Exception):
-    """The budget of candidates is spent; COBYLA itself knows none below its number of variables plus two."""
+    """Ends COBYLA when all candidates are tried: by itself it tries at least its number of variables plus two."""
 
 
 class Search:
