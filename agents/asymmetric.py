@@ -193,7 +193,8 @@ class LearnState(BaseCallback):
     """Fits the :class:`StateEstimator` of an :class:`Asymmetric` policy while it learns.
 
     After each update it goes once through the last rollout in batches of 512, at the algorithm's learning rate; not
-    before the update, which must meet the actor that acted. An algorithm with a replay buffer gives it one batch.
+    before the update, which must meet the actor that acted. An algorithm with a replay buffer gives it as many batches
+    as the critics have.
     """
 
     seen: torch.Tensor | None = None
@@ -212,7 +213,7 @@ class LearnState(BaseCallback):
         if hasattr(model, "rollout_buffer"):
             self.seen = torch.as_tensor(model.rollout_buffer.observations, device=model.device).flatten(0, 1)
         elif model.num_timesteps > model.learning_starts:
-            self.seen = model.replay_buffer.sample(512).observations
+            self.seen = model.replay_buffer.sample(512 * max(model.gradient_steps, 1)).observations
 
     def _on_rollout_start(self) -> None:
         if self.seen is None:

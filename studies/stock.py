@@ -1,7 +1,7 @@
 """Stock learners on the environment as it comes: ``python -m studies.stock`` trains those of stable-baselines3.
 
-Each is judged on validation crystals of ``randomized`` after half of its actions and after all, with each training
-seed. Runs that ``--out`` holds are not trained again.
+Each is judged on validation crystals of ``randomized``, on the way and at the end, with each training seed. Runs that
+``--out`` holds are not trained again.
 """
 
 import argparse
@@ -10,6 +10,7 @@ import io
 import pkgutil
 import sys
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -25,6 +26,10 @@ from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.names import unknown
 
 MILLION = 1_000_000
+SHORT = (MILLION // 4, MILLION // 2)
+HELD = (MILLION // 2, MILLION, 2 * MILLION)
+"""Numbers of actions that are held for four steps: the first is two million steps."""
+LITTLE_ENTROPY = MappingProxyType({"gradient_steps": 4, "ent_coef": "auto_0.005", "target_entropy": 0.5})
 
 
 class Learner(NamedTuple):
@@ -42,8 +47,8 @@ class Learner(NamedTuple):
     """Environment steps that an action is held for in training."""
     normalised: Mapping[str, Any] | None = None
     """Arguments of the ``VecNormalize`` around the environment; None for none."""
-    actions: int = 2 * MILLION
-    """Actions that it learns from; it is judged after half of them and after all."""
+    judged: tuple[int, ...] = (MILLION, 2 * MILLION)
+    """Numbers of actions after which it is judged; with the last one it ends."""
     settings: Mapping[str, Any] = MappingProxyType({})
     """Arguments of the algorithm."""
 
@@ -56,15 +61,23 @@ LEARNERS = {
         "ppo, 8 crystals, VecNormalize, smaller steps", 8, normalised={}, settings={"learning_rate": 3e-5}
     ),
     "ppo-16-normalised": Learner("ppo, 16 crystals, VecNormalize", 16, normalised={}),
-    "ppo-8-held": Learner("ppo, 8 crystals, VecNormalize, actions held 20 s", 8, action_repeat=4, normalised={}),
-    "ppo-16-held": Learner("ppo, 16 crystals, VecNormalize, actions held 20 s", 16, action_repeat=4, normalised={}),
-    "recurrent-8": Learner(
-        "recurrent ppo on measured, 8 crystals", 8, "ppo_lstm", "MlpLstmPolicy", "measured", actions=MILLION // 2
+    "ppo-8-held": Learner(
+        "ppo, 8 crystals, VecNormalize, actions held 20 s", 8, action_repeat=4, normalised={}, judged=HELD
     ),
-    "sac-8": Learner("sac, 8 crystals", 8, "sac", actions=MILLION // 2),
+    "ppo-16-held": Learner(
+        "ppo, 16 crystals, VecNormalize, actions held 20 s", 16, action_repeat=4, normalised={}, judged=HELD
+    ),
+    "recurrent-8": Learner(
+        "recurrent ppo on measured, 8 crystals", 8, "ppo_lstm", "MlpLstmPolicy", "measured", judged=SHORT
+    ),
+    "sac-8": Learner("sac, 8 crystals", 8, "sac", judged=SHORT),
     "sac-64": Learner(
-        "sac, 64 crystals, actions held 20 s, little entropy", 64, "sac", action_repeat=4, actions=MILLION,
-        settings={"gradient_steps": 4, "ent_coef": "auto_0.005", "target_entropy": 0.5},
+        "sac, 64 crystals, actions held 20 s, little entropy", 64, "sac", action_repeat=4, judged=HELD[:2],
+        settings=LITTLE_ENTROPY,
+    ),
+    "tqc-64": Learner(
+        "tqc, 64 crystals, actions held 20 s, little entropy", 64, "tqc", action_repeat=4, judged=HELD[:2],
+        settings=LITTLE_ENTROPY,
     ),
 }  # fmt: skip
 HEADS = ("learner", "actions", "training seeds", "RMSE of each seed [mm]", "lost of each seed [%]")
@@ -75,7 +88,7 @@ ABOUT = """# Stock learners: stable-baselines3 on the environment as it comes
 
 
 def train(name: str, seed: int) -> list[tuple[Any, ...]]:
-    """Rows of :data:`COLUMNS`: one learner, one training seed, after half of its actions and after all."""
+    """Rows of :data:`COLUMNS`: one learner and training seed, after each number of actions."""
     import torch
     from stable_baselines3.common.vec_env import VecNormalize
 
@@ -89,9 +102,9 @@ def train(name: str, seed: int) -> list[tuple[Any, ...]]:
     env = env if learner.normalised is None else VecNormalize(env, **learner.normalised)
     algorithm: Any = pkgutil.resolve_name(ALGORITHMS[learner.algorithm])
     model = algorithm(learner.policy, env, seed=seed, device="cpu", **learner.settings)
-    rows, half = list[tuple[Any, ...]](), learner.actions // 2
-    for actions in (half, 2 * half):
-        model.learn(half, reset_num_timesteps=False)
+    rows = list[tuple[Any, ...]]()
+    for before, actions in pairwise((0, *learner.judged)):
+        model.learn(actions - before, reset_num_timesteps=False)
         agent = to_agent(model, "stock", seed, config, model.get_vec_normalize_env(), "stock.onnx")
         judged = validate(agent, config, JUDGING)
         rows.append((learner.words, seed, actions, f"{judged.rmse_mm:.4f}", f"{judged.failure_rate:.4f}"))

@@ -158,8 +158,8 @@ class SAC(Reinforcement):
     name: str = "sac"
     hidden: tuple[int, ...] = (32, 32)
     critic_hidden: tuple[int, ...] = (128, 128)
-    steps: int = 5_000_000
-    num_envs: int = 256
+    steps: int = 20_000_000
+    num_envs: int = 512
     action_repeat: int = 4
     n_steps: int = 4
     fewest_updates: int = 4000
