@@ -20,7 +20,7 @@ AGENTS = {
     "ppo": "proximal policy optimisation from nothing, its actions from the reward; a network that estimates the state "
     "from sensors was fitted to the true state, which the critic saw too, in training only",
     "ppo-plain": "proximal policy optimisation from nothing, from the reward alone",
-    "sac": "soft actor-critic from nothing, from the reward; its critics saw the true state in training",
+    "sac": "soft actor-critic from nothing, its actions from the reward; its estimate and its critics as those of ppo",
 }
 """Shipped agents, and how each learned."""
 FIGURES = (

@@ -8,7 +8,7 @@ from cz_gym.agents.agent_file.contract import read_agent
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 
-SHIPPED = {"gradient": 10, "gradient-along": 5, "ppo": 5, "ppo-along": 5, "ppo-plain": 3}
+SHIPPED = {"gradient": 10, "gradient-along": 5, "ppo": 5, "ppo-along": 5, "ppo-plain": 3, "sac": 5}
 """Training seeds of each name."""
 
 
