@@ -26,12 +26,14 @@ def curves(runs: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> bytes:
                 look = {"color": style[name].colour, "marker": style[name].marker}
                 label = name if place == 0 and axis is panels[0] else None
                 axis.plot([each / unit for each in spent], error, ms=2.5, lw=1.0, label=label, **look)
-        for place, name in enumerate([*last][len(COLUMNS) :]):
-            axis.axhline(rmse := float(last[name]), color=INK, lw=0.9, ls="--")
+        references = {name.removesuffix("_rmse_mm"): float(last[name]) for name in [*last][len(COLUMNS) :]}
+        for name, rmse in references.items():
+            axis.axhline(rmse, color=INK, lw=0.9, ls="--")
             if axis is panels[0]:
-                named, at = name.removesuffix("_rmse_mm"), (0.99 - 0.2 * place, rmse)  # lines may be close together
-                axis.annotate(named, at, (0, 2), axis.get_yaxis_transform(), textcoords="offset points", ha="right",
-                              fontsize=8, color=INK)  # fmt: skip
+                lowest = rmse == min(references.values())  # lines may be close together
+                axis.annotate(name, (0.99, rmse), (0, -2 if lowest else 2), axis.get_yaxis_transform(), color=INK,
+                              textcoords="offset points", ha="right", va="top" if lowest else "bottom",
+                              fontsize=8)  # fmt: skip
         axis.set(xscale="log", yscale="log", xlabel=title)
         for each in (axis.xaxis, axis.yaxis):
             each.set_major_formatter(lambda value, _: f"{value:g}")
