@@ -208,7 +208,7 @@ def test_agent_files_that_cannot_be_used_get_one_line(tmp_path, refusal):
     other = constant_agent(tmp_path / "other.onnx", training_seed=1, scenario="hard", scenario_hash="0" * 16)
     assert "different scenarios: hard, randomized" in refusal(["--agent", twice, "--agent", str(other)])
     assert "choose from" in (line := refusal(["--agent", f"mine={twice}", "--controllers", "your"]))
-    assert "clairvoyant, mine, gradient, ppo, ppo-plain, or all" in line
+    assert "clairvoyant, mine, gradient, ppo, ppo-plain, sac, or all" in line
 
 
 def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path):
