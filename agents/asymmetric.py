@@ -193,8 +193,8 @@ class LearnState(BaseCallback):
     """Fits the :class:`StateEstimator` of an :class:`Asymmetric` policy while it learns.
 
     After each update it goes once through the last rollout in batches of 512, at the algorithm's learning rate; not
-    before the update, which must meet the actor that acted. An algorithm with a replay buffer gives it as many batches
-    as the critics have.
+    before the update, which must meet the actor that acted. An algorithm with a replay buffer gives it a batch for each
+    of its ``gradient_steps``, at least one.
     """
 
     seen: torch.Tensor | None = None

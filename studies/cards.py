@@ -15,12 +15,15 @@ from cz_gym.evaluation.statistics import Estimate
 from cz_gym.support.atomic_files import check_writable, write_files
 from cz_gym.support.command_line import OneLineParser
 
+TOLD = (
+    "its actions from the reward; a network that estimates the state from sensors was fitted to the true state, "
+    "which the critic saw too, in training only"
+)
 AGENTS = {
     "gradient": "analytic policy gradients: the cost's gradient through policy and plant; the plant is known",
-    "ppo": "proximal policy optimisation from nothing, its actions from the reward; a network that estimates the state "
-    "from sensors was fitted to the true state, which the critic saw too, in training only",
+    "ppo": f"proximal policy optimisation from nothing, {TOLD}",
     "ppo-plain": "proximal policy optimisation from nothing, from the reward alone",
-    "sac": "soft actor-critic from nothing, its actions from the reward; its estimate and its critics as those of ppo",
+    "sac": f"soft actor-critic from nothing, {TOLD}",
 }
 """Shipped agents, and how each learned."""
 FIGURES = (

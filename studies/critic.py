@@ -14,17 +14,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from gymnasium.vector import AutoresetMode
 
 from cz_gym import CzVectorEnv
-from cz_gym.agents.asymmetric import LearnState
-from cz_gym.agents.training.algorithms import make_algorithm
 from cz_gym.agents.training.recipes import SAC
 from cz_gym.agents.training.validation import JUDGING, validate
 from cz_gym.errors import CzError
 from cz_gym.evaluation.report.tables import markdown
-from cz_gym.sb3 import CzVecEnv
 from cz_gym.support.atomic_files import write_files
 from cz_gym.support.command_line import OneLineParser
 
@@ -44,6 +40,10 @@ HEADS = ("changed", "updates", "cosine, pull", "cosine, heater", *(f"cost, {name
 
 def slopes(model: Any, recipe: SAC) -> tuple[Floats, Floats]:
     """True slopes of the discounted rewards by the action, and the critics', each of shape (crystals, 2)."""
+    import torch
+
+    from cz_gym.sb3 import CzVecEnv
+
     settings = recipe.config, CRYSTALS, AutoresetMode.SAME_STEP
     env = CzVecEnv(CzVectorEnv.from_config(*settings, info="all"), critic_state=True)
     env.seed(FIRST_SEED)
@@ -82,7 +82,9 @@ def earned(model: Any, recipe: SAC, env: CzVectorEnv, action: Floats) -> tuple[F
 
 
 def cosines(true: Floats, found: Floats) -> Floats:
-    """Cosine between both slopes over all crystals, of each drive [-]."""
+    """Cosine between both slopes over all crystals, of each drive [-]; NaN without any."""
+    if not len(true):
+        return np.full(true.shape[1], np.nan)
     usual = (np.abs(true) <= np.quantile(np.abs(true), TAIL, axis=0)).all(axis=1)
     true, found = true[usual], found[usual]
     cosine: Floats = (true * found).sum(0) / np.sqrt((true**2).sum(0) * (found**2).sum(0))
@@ -91,6 +93,9 @@ def cosines(true: Floats, found: Floats) -> Floats:
 
 def row(changes: Sequence[str], seed: int) -> tuple[str, ...]:
     """Train the changed recipe, and a row of the table."""
+    from cz_gym.agents.asymmetric import LearnState
+    from cz_gym.agents.training.algorithms import make_algorithm
+
     recipe = changed(changes)
     model = make_algorithm(recipe, seed)
     model.learn(recipe.steps // recipe.action_repeat, LearnState())

@@ -123,7 +123,7 @@ class Reinforcement(Recipe):
         return self.action_repeat * self.n_steps
 
     def with_steps(self, steps: int) -> Self:
-        """As for every recipe; batches become smaller with the rollouts."""
+        """As for every recipe; batches become smaller as the number of crystals does."""
         fewer = super().with_steps(steps)
         return replace(fewer, batch_size=max(self.batch_size * fewer.num_envs // self.num_envs, LEAST_BATCH))
 
@@ -174,8 +174,7 @@ class SAC(Reinforcement):
     ent_coef: str = "auto_0.005"
     """Initial weight of the entropy; it adapts."""
     target_entropy: float = 0.5
-    """Entropy of an action's distribution that the weight adapts to: a standard deviation of 0.3 in each drive. With
-    less noise the critics cannot tell what an action does."""
+    """Entropy of an action's distribution that the weight adapts to: a standard deviation of 0.3 in each drive."""
 
     @property
     def steps_between(self) -> int:

@@ -31,3 +31,12 @@ def test_the_numbers_of_a_recipe_reach_its_algorithm(name):
             given += 1
             assert (found(1.0) if callable(found) else found) == wanted, field
     assert given >= 1
+
+
+@pytest.mark.parametrize(("name", "batch"), [("ppo", 174), ("sac", 125)])
+def test_a_small_budget_has_fewer_crystals_and_smaller_batches(name, batch):
+    recipe, small = RECIPES[name], RECIPES[name].with_steps(2_000_000)
+    assert (small.steps, small.batch_size) == (2_000_000, batch)
+    assert small.num_envs < recipe.num_envs
+    assert small.updates == pytest.approx(recipe.fewest_updates, rel=0.02)
+    assert recipe.with_steps(recipe.steps) == recipe
