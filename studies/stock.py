@@ -29,6 +29,7 @@ MILLION = 1_000_000
 SHORT = (MILLION // 4, MILLION // 2)
 HELD = (MILLION // 2, MILLION, 2 * MILLION)
 """Numbers of actions that are held for four steps: the first is two million steps."""
+LITTLE_ENTROPY = MappingProxyType({"gradient_steps": 4, "ent_coef": "auto_0.005", "target_entropy": 0.5})
 
 
 class Learner(NamedTuple):
@@ -72,7 +73,11 @@ LEARNERS = {
     "sac-8": Learner("sac, 8 crystals", 8, "sac", judged=SHORT),
     "sac-64": Learner(
         "sac, 64 crystals, actions held 20 s, little entropy", 64, "sac", action_repeat=4, judged=HELD[:2],
-        settings={"gradient_steps": 4, "ent_coef": "auto_0.005", "target_entropy": 0.5},
+        settings=LITTLE_ENTROPY,
+    ),
+    "tqc-64": Learner(
+        "tqc, 64 crystals, actions held 20 s, little entropy", 64, "tqc", action_repeat=4, judged=HELD[:2],
+        settings=LITTLE_ENTROPY,
     ),
 }  # fmt: skip
 HEADS = ("learner", "actions", "training seeds", "RMSE of each seed [mm]", "lost of each seed [%]")

@@ -23,7 +23,7 @@ from cz_gym.crystal.process import CRYSTAL, ENVIRONMENTS
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.errors import CzError
 from cz_gym.evaluation.processes import side_by_side
-from cz_gym.machine.puller import PullerFile, chosen_puller
+from cz_gym.machine.puller import FOLDER, PullerFile, chosen_puller
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.names import unknown
 
@@ -97,7 +97,10 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
     alike = [each for each in known.values() if isinstance(each, TunedCrystal) == (given.env != CZ)]
     searched = [known[given.controller]] if given.controller else alike
     crystals = isinstance(searched[0], TunedCrystal)
-    folder = (given.out or folder_of(puller)).absolute()
+    beside = folder_of(puller).absolute()
+    if puller.file and puller.file.parent == FOLDER:
+        raise CzError(f"{puller.name} ships with what was designed for it: to search anew, copy {puller.file}")
+    folder = (given.out or beside).absolute()
     tasks: list[Task] = []
     for each in searched:
         config, _ = crystals_on(each, puller)
@@ -119,7 +122,8 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
             lost = f"{100 * figures['failure_rate']:.0f} % lost"
             bar.write(f"{tasks[number][0].name}: {said}, {lost} on validation crystals, {among}")
     command = f"cz-gym benchmark --puller {puller.file or puller.name}"
-    print(f"wrote {folder}: {command}{f' --env {CRYSTAL.name}' if crystals else ''} runs what was designed")
+    moved = "" if folder == beside else f"moved to {beside}, "
+    print(f"wrote {folder}: {moved}{command}{f' --env {CRYSTAL.name}' if crystals else ''} runs what was designed")
 
 
 def search_for(task: Task) -> Trial:

@@ -124,6 +124,10 @@ def test_one_command_designs_and_another_runs_it(tmp_path, monkeypatch, capsys):
     assert tune.main(["--puller", str(place), "--controller", "lqg"]) == 2
     assert tune.main(["--puller", str(place), "--scenario", "hard"]) == 2
     assert "leave both options out" in capsys.readouterr().err
+    assert tune.main(["--puller", str(place), "--trials", "10", "--controller", "industrial", "--out", str(out)]) == 0
+    assert f"wrote {out}: moved to {tmp_path / 'mine'}, cz-gym benchmark" in capsys.readouterr().out
+    assert tune.main(["--puller", "germanium"]) == 2
+    assert "germanium ships with what was designed for it: to search anew, copy" in capsys.readouterr().err
 
 
 def test_whole_crystals_of_a_puller_have_searches_of_their_own(tmp_path, monkeypatch, capsys):
