@@ -17,7 +17,7 @@ COMMANDS = {
     "recipe": ("cz_gym.commands.recipe", "set points of a whole crystal against its length"),
     "export": ("cz_gym.machine.export.command", "write a controller or agent as code for a PLC"),
     "serve": ("cz_gym.machine.serve.command", "run a virtual puller on OPC UA"),
-    "play": ("cz_gym.play", "pull a crystal by hand"),
+    "play": ("cz_gym.commands.play", "pull a crystal by hand"),
     "data": ("cz_gym.datasets", "record datasets for offline learning"),
 }
 """For each word its module, whose ``main`` takes the arguments after it, and what it does."""

@@ -5,8 +5,6 @@ drifting heat load does to radius and pull speed on the puller's linear models, 
 settings whose loop, opened at the camera, has less than GAIN_MARGIN or PHASE_MARGIN on Model I or II.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import lru_cache
@@ -95,7 +93,7 @@ def fallback(config: Config) -> Fallback:
 def _searched(config: Config, latency: float, window: float, noise: float) -> Fallback:
     plant, random = _plant(config, latency, window, noise), np.random.default_rng(0)
     start, names = scaled(CONVENTIONAL.settings(RANDOMIZED), config), list(MIDDLE)
-    middle, best, found = np.array(list(MIDDLE.values())), math.inf, None
+    middle, best, chosen = np.array(list(MIDDLE.values())), math.inf, None
     for trial in range(CANDIDATES):
         values = middle * np.exp(
             (0.7 if best == math.inf else 0.3 if trial < CANDIDATES // 2 else 0.12)
@@ -105,10 +103,10 @@ def _searched(config: Config, latency: float, window: float, noise: float) -> Fa
         candidate = _scaled(start, FIXED | dict(zip(names, values.tolist(), strict=True)), plant.scale)
         for pid, price, margins in _priced(candidate, config, plant):
             if price < best and _stable(pid, config):
-                best, middle, found = price, values, Fallback(pid, margins[0], margins[1], latency)
-    if found is None:
+                best, middle, chosen = price, values, Fallback(pid, margins[0], margins[1], latency)
+    if chosen is None:
         raise CzError(f"no PID keeps margins of {GAIN_MARGIN} and {PHASE_MARGIN} deg on puller {config.puller.label}")
-    return found
+    return chosen
 
 
 def _scaled(start: FilteredPID, values: dict[str, float], scale: dict[str, float]) -> FilteredPID:
@@ -192,8 +190,8 @@ def margins_of(L: Any) -> tuple[float, float, float]:
 def _crossed(through_zero: Floats, other: Floats, at: Any) -> Floats:
     """Another curve where one goes through zero between neighbours."""
     share = through_zero[at] / (through_zero[at] - through_zero[at + 1])
-    found: Floats = other[at] + share * (other[at + 1] - other[at])
-    return found
+    values: Floats = other[at] + share * (other[at + 1] - other[at])
+    return values
 
 
 def _stable(pid: FilteredPID, config: Config) -> bool:

@@ -81,9 +81,9 @@ def record(policy: Any, config: Config, seeds: Sequence[int], noise: float) -> l
         for noise_now in added:
             measured = settings["observation"] == "measured"
             shown = to_measured(observation, *config.ranges) if measured else observation
-            found, memory = policy.predict(shown, state=memory, episode_start=begins, deterministic=True)
+            chosen, memory = policy.predict(shown, state=memory, episode_start=begins, deterministic=True)
             # "smooth" and "rate" actions act on the drives without the excitation of the step before.
-            wanted = drives.keep * (observation[:, place] - before) + gains * found
+            wanted = drives.keep * (observation[:, place] - before) + gains * chosen
             action = np.clip(wanted + noise_now, -1.0, 1.0).astype(np.float32)
             observation, reward, terminated, truncated, info = env.step(action)
             seen.append((observation, info["r_c"], info["r_ref"], info["state"]))

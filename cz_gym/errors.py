@@ -1,7 +1,5 @@
 """The error that this project raises on purpose."""
 
-from __future__ import annotations
-
 
 class CzError(ValueError):
     """An error whose message tells the user what to change.

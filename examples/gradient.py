@@ -3,8 +3,6 @@
 The gradient of the cost goes back through the plant. ``python benchmark.py --agent runs/gradient.onnx`` runs the agent.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -28,9 +28,9 @@ def make_log(path: str) -> str:
 def main(log_file: str, start: str = "default", out: str = "runs/my.toml") -> float:
     """Write the puller file and its report; return the radius error of an LQG designed for it [mm]."""
     log = read_log(log_file)
-    found = identify(log, find_puller(start))
-    pages = report(found, log, log_file, Path(out).with_suffix(".md"))
-    write_files(pages | {Path(out): to_toml(found.puller).encode()})
+    identified = identify(log, find_puller(start))
+    pages = report(identified, log, log_file, Path(out).with_suffix(".md"))
+    write_files(pages | {Path(out): to_toml(identified.puller).encode()})
     config = make_config("randomized", observation="measured", action="direct", puller=out)
     return float(metrics(rollout(make_controller("lqg", config), config, range(20))).rmse_mm.mean())
 

@@ -156,8 +156,10 @@ LEARNERS = {"behaviour cloning": clone, "TD3+BC": td3_bc}
 
 def score(policy: Any, dataset: Any) -> tuple[float, float]:
     """Normalised score, and share of crystals lost [%]."""
-    found = metrics(rollout(policy, make_config("randomized"), CRYSTALS))
-    return 100.0 * float(minari.get_normalized_score(dataset, found.return_).mean()), 100.0 * found.failure_rate.mean()
+    figures = metrics(rollout(policy, make_config("randomized"), CRYSTALS))
+    return 100.0 * float(
+        minari.get_normalized_score(dataset, figures.return_).mean()
+    ), 100.0 * figures.failure_rate.mean()
 
 
 def compare(name: str, seeds: int) -> list[tuple[str, ...]]:
@@ -167,11 +169,11 @@ def compare(name: str, seeds: int) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     rows += [(name, "its recorded returns", f"{100.0 * minari.get_normalized_score(dataset, recorded).mean():.1f}", "")]
     for learner, learn in LEARNERS.items():
-        found = []
+        scored = []
         for seed in range(seeds):
             torch.manual_seed(seed)
-            found.append(score(learn(steps, make), dataset))
-        scores, lost = np.array(found).T
+            scored.append(score(learn(steps, make), dataset))
+        scores, lost = np.array(scored).T
         rows.append(
             (name, learner, f"{scores.mean():.1f} [{scores.min():.1f}, {scores.max():.1f}]", f"{lost.mean():.1f}")
         )

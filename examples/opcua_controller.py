@@ -4,8 +4,6 @@ It reads the tags of ``cz-gym serve``, calls the exported block, which has input
 and writes both setpoints and the step that they answer.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import logging

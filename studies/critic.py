@@ -81,13 +81,13 @@ def earned(model: Any, recipe: SAC, env: CzVectorEnv, action: Floats) -> tuple[F
     return total, weight > 0.0
 
 
-def cosines(true: Floats, found: Floats) -> Floats:
+def cosines(true: Floats, learned: Floats) -> Floats:
     """Cosine between both slopes over all crystals, of each drive [-]; NaN without any."""
     if not len(true):
         return np.full(true.shape[1], np.nan)
     usual = (np.abs(true) <= np.quantile(np.abs(true), TAIL, axis=0)).all(axis=1)
-    true, found = true[usual], found[usual]
-    cosine: Floats = (true * found).sum(0) / np.sqrt((true**2).sum(0) * (found**2).sum(0))
+    true, learned = true[usual], learned[usual]
+    cosine: Floats = (true * learned).sum(0) / np.sqrt((true**2).sum(0) * (learned**2).sum(0))
     return cosine
 
 

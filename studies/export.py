@@ -82,8 +82,8 @@ def study(controller: str, scenario: str, crystals: int) -> list[Row]:
 
     def grown(runner: Runner) -> Sequence[float]:
         run = rollout(BlockPolicy(block, runner), block.config, VALIDATION_SEEDS[:crystals])
-        found = metrics(run)
-        rmse, step = float(np.mean(found.rmse_mm)), float(np.mean(found.pull_step_rms_mm_per_min))
+        figures = metrics(run)
+        rmse, step = float(np.mean(figures.rmse_mm)), float(np.mean(figures.pull_step_rms_mm_per_min))
         return round(rmse, 3), round(step, 4), int(run.failed.sum())
 
     watched, worst = beside(block, compiled)

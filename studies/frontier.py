@@ -61,9 +61,9 @@ def table(results: Mapping[str, Means], metric: str, episodes: Episodes | None =
     heads = ("controller", "pull step RMS [mm/min]", f"{metric.removesuffix('_mm')} [mm]", "of the LQG's", "return")
     sections = []
     for scenario, means in results.items():
-        points = {name: (found[ACTIVITY].mean, found[metric].mean) for name, found in means.items()}
+        points = {name: (figures[ACTIVITY].mean, figures[metric].mean) for name, figures in means.items()}
         try:
-            found = ratios(points, FAMILY)
+            ratio_of = ratios(points, FAMILY)
             most = frontier([points[name] for name in FAMILY if name in points]).activity[-1]
         except CzError as error:
             sections.append(f"## {scenario}\n\n{error}.")
@@ -71,11 +71,11 @@ def table(results: Mapping[str, Means], metric: str, episodes: Episodes | None =
         spread = {} if episodes is None else _intervals(scenario, points, episodes.get(scenario, {}))
         rows = []
         for name, (activity, rmse) in points.items():
-            ratio = f"{found[name]:.3f}" if name in found else "quieter than any LQG"
-            ratio += " [{:.3f}, {:.3f}]".format(*spread[name]) if name in found and name in spread else ""
+            ratio = f"{ratio_of[name]:.3f}" if name in ratio_of else "quieter than any LQG"
+            ratio += " [{:.3f}, {:.3f}]".format(*spread[name]) if name in ratio_of and name in spread else ""
             ratio += f", more active than any LQG ({most:.4f})" if activity > most else ""
             rows.append((name, f"{activity:.4f}", f"{rmse:.4f}", ratio, f"{means[name][RETURN].mean:.0f}"))
-        sections.append(f"## {scenario}\n\n{markdown(heads, rows)}\n\n{ranking(means, found)}".rstrip())
+        sections.append(f"## {scenario}\n\n{markdown(heads, rows)}\n\n{ranking(means, ratio_of)}".rstrip())
     return "\n\n".join(sections)
 
 

@@ -52,7 +52,7 @@ class Row(NamedTuple):
     """The identification of a puller and its use."""
 
     truth: PullerFile
-    found: Identified
+    identified: Identified
     passive: tuple[float, float]
     """Excitation of pull speed and heater in the log without excitation, in multiples of what is needed."""
     rmse_mm: tuple[float, ...]
@@ -63,7 +63,7 @@ class Row(NamedTuple):
     @property
     def inside(self) -> list[bool]:
         """Whether the interval holds the truth, of every informed parameter."""
-        told = [e for e in self.found.estimates if e.informed and e.name in Parameters._fields]
+        told = [e for e in self.identified.estimates if e.informed and e.name in Parameters._fields]
         return [e.low <= getattr(self.truth.parameters, e.name) <= e.high for e in told]
 
 
@@ -106,8 +106,8 @@ def study(number: int, crystals: int) -> Row:
     start, truth = draw(number)
     with tempfile.TemporaryDirectory() as name:
         excited, passive = write_logs(truth, number, Path(name))
-        found, without = identify(read_log(excited), start), measure_excitation([read_log(passive)], start)
-        write_puller(found.puller, Path(name) / "my.toml")
+        outcome, without = identify(read_log(excited), start), measure_excitation([read_log(passive)], start)
+        write_puller(outcome.puller, Path(name) / "my.toml")
         identified = read_puller(Path(name) / "my.toml")
     config = make_config(SCENARIO, observation="measured", action="direct", puller=truth)
     (tuned,) = (each for each in LQGS if each.name == FILTER)
@@ -118,7 +118,7 @@ def study(number: int, crystals: int) -> Row:
     ]
     runs = [rollout(policy, config, VALIDATION_SEEDS[:crystals]) for policy in policies]
     rmse = tuple(float(np.sqrt(np.mean(np.square(metrics(run).rmse_mm)))) for run in runs)
-    return Row(truth, found, without, rmse, tuple(int(run.failed.sum()) for run in runs))
+    return Row(truth, outcome, without, rmse, tuple(int(run.failed.sum()) for run in runs))
 
 
 def report(rows: Sequence[Row]) -> str:

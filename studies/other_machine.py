@@ -55,7 +55,7 @@ class Row(NamedTuple):
     """One case of the chain."""
 
     case: str
-    found: Identified
+    identified: Identified
     errors: tuple[float, float]
     """Root mean square radius error with the identified and with the true file [mm]."""
     lost: tuple[int, int]
@@ -90,9 +90,9 @@ def drawn(number: int) -> dict[str, float]:
 def held(number: int) -> tuple[Identified, list[bool]]:
     """A drawn machine's identification, and whether the interval of each informed parameter holds the truth."""
     zone = drawn(number)
-    found = identify(log_of(zone, {}, number, **PLC), machine_file(ZONE, {}, "start"))
-    told = [e for e in found.estimates if e.informed and e.name in HOT_ZONE + MELT]
-    return found, [e.low <= zone[e.name] <= e.high for e in told]
+    identified = identify(log_of(zone, {}, number, **PLC), machine_file(ZONE, {}, "start"))
+    told = [e for e in identified.estimates if e.informed and e.name in HOT_ZONE + MELT]
+    return identified, [e.low <= zone[e.name] <= e.high for e in told]
 
 
 def run(
@@ -129,10 +129,10 @@ def chain(case: str, crystals: int = CRYSTALS, seed: int = 1) -> Row:
     """Log, identify, design, export and drive a machine, with the identified and with the true file."""
     quirks, zone = CASES[case], drawn(seed)
     known = {name: quirks[name] for name in ("camera_latency",) if name in quirks}
-    found = identify(log_of(zone, quirks, seed, **PLC), machine_file(ZONE, known, "start"))
-    results = [run(file, zone, quirks, crystals) for file in (found.puller, machine_file(zone, quirks, "truth"))]
+    identified = identify(log_of(zone, quirks, seed, **PLC), machine_file(ZONE, known, "start"))
+    results = [run(file, zone, quirks, crystals) for file in (identified.puller, machine_file(zone, quirks, "truth"))]
     (mine, true), (lost, lost_too) = zip(*results, strict=True)
-    return Row(case, found, (mine, true), (lost, lost_too))
+    return Row(case, identified, (mine, true), (lost, lost_too))
 
 
 def report(rows: Sequence[Row], inside: Sequence[Sequence[bool]], fits: int) -> str:
@@ -141,7 +141,7 @@ def report(rows: Sequence[Row], inside: Sequence[Sequence[bool]], fits: int) -> 
     lines = []
     for row in rows:
         errors = *(f"{error:.3f}" for error in row.errors), f"{row.errors[0] / row.errors[1]:.2f}"
-        lines.append((row.case, "no" if row.found.misfits else "yes", *errors, *map(str, row.lost)))
+        lines.append((row.case, "no" if row.identified.misfits else "yes", *errors, *map(str, row.lost)))
     flat = [each for one in inside for each in one]
     share = f"{np.mean(flat) / PERCENT:.0f} % of {len(flat)}" if flat else "none"
     return f"""{markdown(heads, lines)}
@@ -169,10 +169,10 @@ def _main(given: argparse.Namespace) -> None:
         rows.append(chain(case))
         save()
     for number in range(MACHINES):
-        found, hold = held(number)
+        identified, hold = held(number)
         inside.append(hold)
-        fits += not found.misfits
-        print(f"log {number}: {sum(hold)} of {len(hold)} intervals hold the truth; {found.verdict}", flush=True)
+        fits += not identified.misfits
+        print(f"log {number}: {sum(hold)} of {len(hold)} intervals hold the truth; {identified.verdict}", flush=True)
         save()
     print(report(rows, inside, fits), end="")
 

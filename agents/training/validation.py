@@ -61,11 +61,11 @@ def references(make_controller: Callable[[str, Config], Any], recipe: Recipe) ->
     config = replace(recipe.config, observation="measured", action="direct")
     # Classical controllers are designed for one scenario.
     design = config if len(config.scenario.scenarios) == 1 else config.with_scenario("randomized")
-    found = {}
+    rmses = {}
     for name in REFERENCES[config.process.name]:
         policy = make_controller(name, design)
-        found[name] = validate(policy, config, PICKING).rmse_mm, validate(policy, config, JUDGING).rmse_mm
-    return found
+        rmses[name] = validate(policy, config, PICKING).rmse_mm, validate(policy, config, JUDGING).rmse_mm
+    return rmses
 
 
 def costs(measured: Metrics) -> Floats:

@@ -103,7 +103,10 @@ def lqg_goal(
         cost = -figures.mean_return / figures.steps if by_return else figures.rmse_mm / rmse_mm
         return 10.0 * cost + 100.0 * figures.failure_rate
 
-    limits = (lambda found, _: 1.0 - found.rmse_mm / rmse_mm, lambda found, _: 1.0 - found.pull_step / pull_step)
+    limits = (
+        lambda figures, _: 1.0 - figures.rmse_mm / rmse_mm,
+        lambda figures, _: 1.0 - figures.pull_step / pull_step,
+    )
     return Goal(start, parameters, survive, objective, limits, failure_price=100.0, miss_price=20.0)
 
 

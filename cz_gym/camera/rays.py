@@ -196,9 +196,9 @@ def _rising(ray: Any, q: Any, scene: Any, view: Any) -> Any:
     shield = _at(SHIELD, ray, (camera.wall_height - ray.z) / ray.dz)
     if t > 0.0 and (ray.z + t * ray.dz < camera.wall_height or not _beyond(shield, camera.shield_radius)):
         return _at(CRYSTAL, ray, t)
-    found = _meet_above(ray, scene, q)
-    if found >= 0.0:
-        return _at_profile(ray, found, scene)
+    t_meniscus = _meet_above(ray, scene, q)
+    if t_meniscus >= 0.0:
+        return _at_profile(ray, t_meniscus, scene)
     if _beyond(shield, camera.crucible_radius):
         return _at(WALL, ray, _meet_cylinder(ray, camera.crucible_radius, True))
     return shield if _beyond(shield, camera.shield_radius) else _at(OPENING, ray, 1.0)
@@ -215,9 +215,9 @@ def _sinking(ray: Any, q: Any, scene: Any, view: Any) -> Any:
             return shield
     if t > 0.0:
         return _at(CRYSTAL, ray, t)
-    found = _meet_below(ray, scene, q)
-    if found >= 0.0:
-        return _at_profile(ray, found, scene)
+    t_meniscus = _meet_below(ray, scene, q)
+    if t_meniscus >= 0.0:
+        return _at_profile(ray, t_meniscus, scene)
     melt = _at(MELT, ray, -ray.z / ray.dz)
     if _beyond(melt, camera.crucible_radius):
         return _at(WALL, ray, _meet_cylinder(ray, camera.crucible_radius, True))

@@ -111,10 +111,10 @@ class RingDetector:
     def read(self, image: npt.NDArray[np.uint8]) -> Ring:
         """The ring in an image of shape (ROWS, COLUMNS) or (ROWS, COLUMNS, 1)."""
         edges, contrast = self.find_edges(image)
-        found = np.isfinite(edges)
-        if found.sum() < LEAST_LINES or contrast < LEAST_SHARE * self.contrast:
+        has_edge = np.isfinite(edges)
+        if has_edge.sum() < LEAST_LINES or contrast < LEAST_SHARE * self.contrast:
             return Ring(math.nan, edges)
-        radii = edges[found] - self.shape[found]
+        radii = edges[has_edge] - self.shape[has_edge]
         start = [float(np.median(radii))]
         fit = least_squares(partial(np.subtract, radii), start, loss="soft_l1", f_scale=ROBUST, xtol=1e-12)
         return Ring(float(fit.x[0]) - self.bias, edges)

@@ -90,10 +90,10 @@ def _check_workers(client: Any, shared: Path | None) -> None:
         if facts["nthreads"] != 1:
             raise CzError(f"worker {worker} has {facts['nthreads']} threads: start it with --nthreads 1")
     try:
-        found = client.run(versions)
+        theirs = client.run(versions)
     except (ImportError, AttributeError) as error:
         raise CzError(f"the workers have no cz_gym, or another one: {error}") from None
-    for worker, own in found.items():
+    for worker, own in theirs.items():
         check_versions(worker, own, versions())
     if shared:
         shared.mkdir(parents=True, exist_ok=True)

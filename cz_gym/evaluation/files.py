@@ -199,7 +199,7 @@ def read_results(path: Path, metrics: Sequence[str]) -> tuple[dict[str, dict[str
         content = json.loads(text)
         results = {
             scenario: {
-                name: {metric: _estimate(found[metric]) for metric in metrics} for name, found in by_name.items()
+                name: {metric: _estimate(figures[metric]) for metric in metrics} for name, figures in by_name.items()
             }
             for scenario, by_name in content["results"].items()
         }
@@ -208,9 +208,9 @@ def read_results(path: Path, metrics: Sequence[str]) -> tuple[dict[str, dict[str
         raise CzError(f"{path} is no benchmark.json") from None
 
 
-def _estimate(found: Mapping[str, Any]) -> Estimate:
-    interval = found.get("ci95")
-    return Estimate(float(found["mean"]), interval and (float(interval[0]), float(interval[1])), found.get("n", 0))
+def _estimate(saved: Mapping[str, Any]) -> Estimate:
+    interval = saved.get("ci95")
+    return Estimate(float(saved["mean"]), interval and (float(interval[0]), float(interval[1])), saved.get("n", 0))
 
 
 def read_episodes(path: Path, columns: Sequence[str]) -> Episodes:

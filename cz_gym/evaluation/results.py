@@ -52,12 +52,12 @@ class Sample:
         """Metrics of rollouts on the same episodes, one a training seed, and the signals of the first one."""
         example, values, times, shares = None, [], [], []
         for run in runs:
-            example, seeds, found = example or run.episode(0), run.seeds, measured(run)
-            values.append(np.stack(found, axis=-1))
+            example, seeds, figures = example or run.episode(0), run.seeds, measured(run)
+            values.append(np.stack(figures, axis=-1))
             times.append(run.microseconds_per_step)
             shares += [outside(run, tolerance)] if tolerance else []
         outside_of = np.array(shares) if shares else None
-        return cls(contender, seeds, np.stack(values), float(np.mean(times)), example, outside_of, type(found))
+        return cls(contender, seeds, np.stack(values), float(np.mean(times)), example, outside_of, type(figures))
 
     @classmethod
     def joined(cls, seeds: Sequence[int], parts: Sequence[Self]) -> Self:

@@ -31,7 +31,7 @@ CACHE_VARIABLE = "CZ_GYM_CACHE_DIR"
 """Environment variable naming the folder for compiled code; empty means: keep none."""
 NEVER_COMPILED = (
     "agents", "baselines", "commands", "datasets.py", "evaluation", "machine/export", "machine/pullers",
-    "machine/serve", "play.py", "rendering", "sb3.py", "support/command_line.py",
+    "machine/serve", "rendering", "sb3.py", "support/command_line.py",
 )  # fmt: skip
 """Parts of the package of which nothing is compiled in; all others count, whatever they hold."""
 FunctionCache: Any = caching.FunctionCache
@@ -137,12 +137,12 @@ class CachedCode(FunctionCache):  # type: ignore[misc]
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Compiled code for this signature; None if there is none that can be loaded."""
         try:
-            found = super().load_overload(sig, target_context)
+            code = super().load_overload(sig, target_context)
         except Exception:
-            found = None
-        if found is None:
+            code = None
+        if code is None:
             announce()
-        return found
+        return code
 
 
 @cache

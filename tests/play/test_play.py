@@ -6,9 +6,10 @@ import sys
 import numpy as np
 import pytest
 
-from cz_gym import CzEnv, play
+from cz_gym import CzEnv
 from cz_gym.baselines.registry import find_controller
 from cz_gym.body.plant import make_puller
+from cz_gym.commands import play
 from cz_gym.config import make_config
 from cz_gym.rendering import canvas
 

@@ -12,8 +12,8 @@ import pytest
 from gymnasium.error import DependencyNotInstalled
 
 import cz_gym_command
-from cz_gym import datasets, play
-from cz_gym.commands import benchmark, tune
+from cz_gym import datasets
+from cz_gym.commands import benchmark, play, tune
 from cz_gym.errors import CzError
 from cz_gym.support.command_line import OPTIONAL, guarded
 from studies import speed

@@ -117,8 +117,8 @@ def _of_crystals(results: Sequence[Result]) -> list[str]:
 
 
 def _verdict(results: Sequence[Result]) -> list[str]:
-    found = contents_of(results[0].row).verdict(results)
-    return [found.sentence, *([table(found.heads, found.rows)] if found.rows else [])]
+    verdict = contents_of(results[0].row).verdict(results)
+    return [verdict.sentence, *([table(verdict.heads, verdict.rows)] if verdict.rows else [])]
 
 
 def _for_a_grower(results: Sequence[Result]) -> list[str]:
@@ -173,10 +173,10 @@ def _training_seeds(pooled: Sequence[Sample]) -> str:
     lines = []
     for sample in pooled:
         seeds = sample.contender.training_seeds
-        found, lost = sample.metric("rmse_mm").mean(axis=1), sample.metric("failure_rate").sum(axis=1)
-        figures = (f"{value:.3f}" for value in (found.min(), np.median(found), found.max()))
+        errors, lost = sample.metric("rmse_mm").mean(axis=1), sample.metric("failure_rate").sum(axis=1)
+        figures = (f"{value:.3f}" for value in (errors.min(), np.median(errors), errors.max()))
         losses = [f"{count:.0f} by seed {seed}" for seed, count in zip(seeds, lost, strict=True) if count]
-        worst = str(seeds[int(found.argmax())])
+        worst = str(seeds[int(errors.argmax())])
         losers = ", ".join(losses) or "none"
         lines.append((sample.name, str(len(seeds)), *figures, worst, losers, str(len(sample.seeds))))
     figures_of = ("best [mm]", "median [mm]", "worst [mm]")
@@ -185,9 +185,9 @@ def _training_seeds(pooled: Sequence[Sample]) -> str:
 
 def terminal(results: Sequence[Result]) -> str:
     """Return a short table a scenario, RMSE with its interval, then means, and the verdict or the recommendation."""
-    found = contents_of(results[0].row).verdict(results, RMSE._replace(interval=False))
-    parts = [*map(_short, results), *([found.sentence] if found.rows or results[0].row.tolerance is None else [])]
-    parts += [_aligned(found.heads, found.rows)] if found.rows else []
+    verdict = contents_of(results[0].row).verdict(results, RMSE._replace(interval=False))
+    parts = [*map(_short, results), *([verdict.sentence] if verdict.rows or results[0].row.tolerance is None else [])]
+    parts += [_aligned(verdict.heads, verdict.rows)] if verdict.rows else []
     return "\n\n".join(parts + ([grower.recommendation(results)] if results[0].row.tolerance else []))
 
 

@@ -35,7 +35,7 @@ _SLOT = re.compile(r"<!-- slot:(\w+) -->")
 def page(results: Sequence[Result], command: str) -> str:
     """Return the page; the same results give the same text."""
     row, samples, shown = results[0].row, results[0].samples, contents_of(results[0].row)
-    found = shown.verdict(results)
+    verdict = shown.verdict(results)
     config, most = row.config(), max(len(result.seeds) for result in results)
     counted = tables.deciding(results)
     best = replace(counted[0], samples=tuple(tables.best_of_each_kind(counted)))
@@ -43,7 +43,7 @@ def page(results: Sequence[Result], command: str) -> str:
     parts = {
         "style": _asset("page.css"),
         "plotly": get_plotlyjs(),
-        "verdict": escape(found.sentence),
+        "verdict": escape(verdict.sentence),
         "best": _table(heads, [(f"{name} [{kind}]", *cells) for kind, rows in groups.items() for name, *cells in rows]),
         "best_note": BEST_NOTE,
         "question": "Who holds the radius best",
@@ -52,7 +52,7 @@ def page(results: Sequence[Result], command: str) -> str:
         "lede": f"{tables.count(len(samples), 'controller')}, {tables.count(len(results), 'scenario')}, "
         f"up to {tables.crystals(most)} each, the same for everyone: at most {config.horizon / HOUR:.3g} h at one "
         f"action every {config.control_interval:g} s, on {row.grown_on}.",
-        "scenarios": _table(found.heads, found.rows) if found.rows else "",
+        "scenarios": _table(verdict.heads, verdict.rows) if verdict.rows else "",
         "tables": "\n".join(_metrics(result, is_open=result is results[0]) for result in results),
         "pareto": _html(pareto(results), "pareto"),
         "crystal": _html(crystal(results), "crystal"),

@@ -91,7 +91,7 @@ def comparison(result: Result) -> tuple[Column, ...]:
     """Return the columns that compare with the reference on the same crystals, with gaps if there are any."""
     if not result.paired:
         return ()
-    return (*_COMPARISON, *(gap for gap in _GAPS if any(gap.metric in found for found in result.gaps.values())))
+    return (*_COMPARISON, *(gap for gap in _GAPS if any(gap.metric in known for known in result.gaps.values())))
 
 
 def label(sample: Sample, result: Result) -> str:
@@ -142,11 +142,11 @@ def overview(results: Sequence[Result]) -> tuple[tuple[str, ...], dict[str, list
     """Return heads, and rows by what contenders knew: RMSE and failures on each scenario, drives on the first."""
     alone = [column._replace(interval=False) for column in (MEAN_PULL, PULL_STEP, HEATER_STEP, RETURN)]
     columns = (RMSE, FAILURES._replace(interval=False), *alone)
-    found = [{name: row for name, *row in rows(result, columns)} for result in results]
+    texts = [{name: row for name, *row in rows(result, columns)} for result in results]
     groups: dict[str, list[tuple[str, ...]]] = {}
     for sample in results[0].samples:
         name = label(sample, results[0])
-        errors, failures, *others = zip(*(each[name] for each in found), strict=True)
+        errors, failures, *others = zip(*(each[name] for each in texts), strict=True)
         line = name, *errors, *(first for first, *_ in others), " / ".join(failures)
         groups.setdefault(sample.contender.knows, []).append(line)
     heads = "controller", *(result.row.name for result in results), *(column.heading for column in alone)

@@ -113,7 +113,7 @@ class Graph:
             with np.errstate(all="ignore"):
                 return self.constant(FUNCTIONS[op](*known))
         if op in ("add", "subtract"):
-            (a, c), (b, d) = map(self._parted, args)
+            (a, c), (b, d) = map(self._split_constant, args)
             if np.any(c) or np.any(d):
                 rest: Traced = a if b is None else self.apply(op, 0.0 if a is None else a, b)
                 if not np.any(constant := FUNCTIONS[op](c, d)):
@@ -121,7 +121,7 @@ class Graph:
                 op, args = "add", np.broadcast_arrays(rest.ids, self.constant(constant).ids)
         return self.add(op, tuple(args), args[0].shape)
 
-    def _parted(self, ids: Ids) -> tuple[Any, Any]:
+    def _split_constant(self, ids: Ids) -> tuple[Any, Any]:
         """A value as a traced part, None if there is none, and the constant that is added to it.
 
         Sums keep their constants last. So the equations of a plant are recorded in deviations from its operating point,

@@ -46,18 +46,18 @@ def _main(given: argparse.Namespace) -> int:
     for path, log in zip(given.log, logs, strict=True):
         check_puller(log, start, str(path))
     check_writable(given.out.parent)
-    found = identify(logs, start, dict(map(_prior, given.prior)))
+    identified = identify(logs, start, dict(map(_prior, given.prior)))
     page, files = given.out.with_suffix(".md"), dict[Path, bytes]()
-    if given.force or not found.misfits:
-        files[given.out] = to_toml(found.puller).encode()
-        files |= {given.series: to_csv(found.series()).encode()} if given.series else {}
-    print(found.verdict)
-    write_files(report(found, logs, ", ".join(path.name for path in given.log), page) | files)
-    for e in found.estimates:
+    if given.force or not identified.misfits:
+        files[given.out] = to_toml(identified.puller).encode()
+        files |= {given.series: to_csv(identified.series()).encode()} if given.series else {}
+    print(identified.verdict)
+    write_files(report(identified, logs, ", ".join(path.name for path in given.log), page) | files)
+    for e in identified.estimates:
         said = f"{e.value:.4g} ({e.low:.4g} to {e.high:.4g})" if e.informed else "this log says nothing about it"
         print(f"{e.name}: {said}")
     print(f"wrote {' and '.join(map(str, (*files, page)))}")
-    return NO_FIT if found.misfits else 0
+    return NO_FIT if identified.misfits else 0
 
 
 def _prior(text: str) -> tuple[str, float]:

@@ -34,20 +34,21 @@ OTHERS = {
 HEADS = "number", "unit", "start", "log", "95 % interval", "uncertainty left [%]", "verdict"
 
 
-def report(found: Identified, log: Log | Sequence[Log], source: str, path: Path) -> dict[Path, bytes]:
+def report(identified: Identified, log: Log | Sequence[Log], source: str, path: Path) -> dict[Path, bytes]:
     """The files of a report, its text at ``path``: what the log ``source`` tells of a puller, and what it does not."""
     readings, numbers = (path.with_name(f"{path.stem}-{name}.png") for name in ("readings", "numbers"))
-    told, moves = sum(e.informed for e in found.estimates), zip(("pull speed", "heater"), found.excitation, strict=True)
-    correlations = [f"{name} {coloured(errors):.2f}" for name, errors in zip(SENSORS, found.errors.T, strict=True)]
+    told = sum(e.informed for e in identified.estimates)
+    moves = zip(("pull speed", "heater"), identified.excitation, strict=True)
+    correlations = [f"{name} {coloured(errors):.2f}" for name, errors in zip(SENSORS, identified.errors.T, strict=True)]
     logs = (log,) if isinstance(log, Log) else log
     notes = ["; ".join(each.notes) or "nothing was left out" for each in logs]
     lines = [f"- {len(each.time)} rows of {each.interval:g} s; {note}." for each, note in zip(logs, notes, strict=True)]
-    text = f"""# {found.verdict[0].upper() + found.verdict[1:]}
+    text = f"""# {identified.verdict[0].upper() + identified.verdict[1:]}
 
-The log {source} tells {told} of {len(found.estimates)} numbers of the puller {found.start.name}; the others keep the
-start's values.
+The log {source} tells {told} of {len(identified.estimates)} numbers of the puller {identified.start.name};
+the others keep the start's values.
 
-{markdown(HEADS, map(_row, (*found.estimates, *found.noise)), "---")}
+{markdown(HEADS, map(_row, (*identified.estimates, *identified.noise)), "---")}
 
 "Uncertainty left" compares the estimate's standard deviation with the start's; below 50 % the log tells the number.
 A log gives lam and dT_0 only as their product, the delays of the heater's path best as their sum, and no phi_b.
@@ -67,13 +68,13 @@ that the model does not have.
 
 ## What one calliper reading would add
 
-{_calliper(found)}
+{_calliper(identified)}
 
 ## The log
 
 {chr(10).join(lines)}
 """
-    return {path: text.encode(), readings: _readings(found), numbers: _numbers(found)}
+    return {path: text.encode(), readings: _readings(identified), numbers: _numbers(identified)}
 
 
 def _row(e: Estimate) -> tuple[str, ...]:
@@ -97,9 +98,10 @@ def _moved(share: float) -> str:
     )
 
 
-def _calliper(found: Identified) -> str:
+def _calliper(identified: Identified) -> str:
     """What the ring's offset would say of phi_b if the crystal's radius were known."""
-    parameters, log, step = (found.start if found.misfits else found.puller).parameters, found.log, 1e-4
+    parameters = (identified.start if identified.misfits else identified.puller).parameters
+    log, step = identified.log, 1e-4
     ring = make_puller(parameters).ring_bias
     slope = (make_puller(parameters._replace(phi_b=parameters.phi_b + step)).ring_bias - ring) / step
     meant = np.where(np.isfinite(log.r_ref), log.r_ref, parameters.r_0)
@@ -112,22 +114,22 @@ def _calliper(found: Identified) -> str:
     )
 
 
-def _readings(found: Identified) -> bytes:
+def _readings(identified: Identified) -> bytes:
     """Drives, readings with their predictions, and prediction errors, as PNG."""
-    figure, log, hours = canvas(8.0, 8.0), found.log, found.log.time / HOUR
+    figure, log, hours = canvas(8.0, 8.0), identified.log, identified.log.time / HOUR
     drives, ring, pyrometer, errors = figure.subplots(4, 1, sharex=True)
     drives.plot(hours, log.v_p / MM_PER_MIN, color=COLOURS[1], lw=0.8, label="pull speed [mm/min]")
     power = drives.twinx()
     power.plot(hours, log.Q_H / KILO, color=COLOURS[0], lw=0.8, label="heater power [kW]")
     for axis, values, error, size, label in (
-        (ring, log.ring, found.predicted.error[:, 1], MM, "ring radius [mm]"),
-        (pyrometer, log.T_1, found.predicted.error[:, 0], 1.0, "T_1 [K]"),
+        (ring, log.ring, identified.predicted.error[:, 1], MM, "ring radius [mm]"),
+        (pyrometer, log.T_1, identified.predicted.error[:, 0], 1.0, "T_1 [K]"),
     ):
         axis.plot(hours, values / size, ".", color=GREY, ms=2, label="measured")
         axis.plot(hours, (values - error) / size, color=COLOURS[1], lw=0.8, label="predicted")
         axis.set_ylabel(label)
     for sensor, name in enumerate(SENSORS):
-        errors.plot(hours, found.errors[:, sensor], ".", color=COLOURS[sensor], ms=2, label=name)
+        errors.plot(hours, identified.errors[:, sensor], ".", color=COLOURS[sensor], ms=2, label=name)
     drives.set_ylabel("pull speed [mm/min]", color=COLOURS[1])
     power.set_ylabel("heater power [kW]", color=COLOURS[0])
     errors.set(xlabel="time [h]", ylabel="error / its sd [-]", ylim=(-5.0, 5.0))
@@ -136,11 +138,11 @@ def _readings(found: Identified) -> bytes:
     return png(figure)
 
 
-def _numbers(found: Identified) -> bytes:
+def _numbers(identified: Identified) -> bytes:
     """Start and estimates with their 95 % intervals, relative to the start, as PNG."""
     figure = canvas(7.0, 4.5)
     axis = figure.subplots()
-    shown = [e for e in found.estimates if e.name not in Lags._fields]
+    shown = [e for e in identified.estimates if e.name not in Lags._fields]
     for y, e in enumerate(shown):
         colour = COLOURS[1] if e.informed else GREY
         axis.plot([max(e.low, 0.0) / e.prior, e.high / e.prior], [y, y], color=colour, lw=2)

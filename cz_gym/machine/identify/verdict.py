@@ -25,33 +25,33 @@ NOISY = 2.5
 """Largest ratio of a sensor's noise to what the start file says."""
 
 
-def misfits(found: Any, puller: Any, away: Mapping[str, float]) -> tuple[str, ...]:
+def misfits(identified: Any, puller: Any, away: Mapping[str, float]) -> tuple[str, ...]:
     """Reasons why the model does not fit the log, in words.
 
-    ``found`` is an :class:`.estimate.Identified`, ``puller`` its puller with Q_H_0 and T_1_0, ``away`` how far each
-    estimate is from its prior's mean, in standard deviations. Only paths that were estimated are judged; a delay or a
-    noise may well be absent.
+    ``identified`` is an :class:`.estimate.Identified`, ``puller`` its puller with Q_H_0 and T_1_0, ``away`` how far
+    each estimate is from its prior's mean, in standard deviations. Only paths that were estimated are judged; a delay
+    or a noise may well be absent.
     """
-    pull, heater = (share >= 1.0 for share in found.excitation)
+    pull, heater = (share >= 1.0 for share in identified.excitation)
     if not (pull or heater):
         return ()
     judged = ((0, "pyrometer", heater), (1, "ring", True))
-    reasons = [] if found.settled else ["the search has not settled"]
+    reasons = [] if identified.settled else ["the search has not settled"]
     for sensor, name, estimated in judged:
-        seen = np.nanstd(found.predicted.error[:, sensor]) > SEEN[sensor]
-        if estimated and seen and (size := coloured(found.errors[:, sensor])) > COLOURED:
+        seen = np.nanstd(identified.predicted.error[:, sensor]) > SEEN[sensor]
+        if estimated and seen and (size := coloured(identified.errors[:, sensor])) > COLOURED:
             reasons.append(f"prediction errors of the {name} are coloured (correlation {size:.2f})")
     if heater:
-        T_1, Q_H = np.nanmean(found.log.T_1), np.mean(found.log.Q_H)
+        T_1, Q_H = np.nanmean(identified.log.T_1), np.mean(identified.log.Q_H)
         if abs(puller.T_1_0.real - T_1) > T_1_OFF:
             reasons.append(f"its T_1 is {puller.T_1_0.real:.0f} K where the log's mean is {T_1:.0f} K")
         if abs(puller.Q_H_0.real / Q_H - 1.0) > Q_H_OFF:
             reasons.append(f"it needs {puller.Q_H_0.real / KILO:.1f} kW where the log's mean is {Q_H / KILO:.1f} kW")
-    parameters = {e.name for e in found.estimates} - set(Lags._fields)
+    parameters = {e.name for e in identified.estimates} - set(Lags._fields)
     ends = [f"{name} ({by:+.1f})" for name, by in away.items() if (abs(by) if name in parameters else by) > FAR]
     if ends:
         reasons.append(f"estimates stand at the ends of their priors [standard deviations]: {', '.join(ends)}")
-    noise, sensors = {e.name: e.value for e in found.noise}, found.start
+    noise, sensors = {e.name: e.value for e in identified.noise}, identified.start
     ring = np.hypot(max(sensors.camera_noise or (0.0,)), max(sensors.ripple or (0.0,)))
     for name, value, usual, unit, size in (
         ("ring", noise["camera_sd"], ring, "mm", MM),
@@ -60,7 +60,7 @@ def misfits(found: Any, puller: Any, away: Mapping[str, float]) -> tuple[str, ..
         if usual and value > NOISY * usual:
             reasons.append(f"noise of the {name} is {value / size:.2g} {unit}, the file says {usual / size:.2g} {unit}")
     try:
-        _ = found.puller
+        _ = identified.puller
     except CzError as error:
         reasons.append(f"its numbers are not plausible: {error}")
     return tuple(reasons)

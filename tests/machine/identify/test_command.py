@@ -84,6 +84,6 @@ def test_a_machine_by_somebody_else_is_logged_identified_designed_for_and_driven
     if shutil.which("cc") is None:
         pytest.skip("no C compiler")
     row = other_machine.chain("heater's lag 10 s", crystals=1)
-    assert not row.found.misfits
+    assert not row.identified.misfits
     assert row.lost == (0, 0)
     assert row.errors[0] < 2.0 * row.errors[1]

@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import pkgutil
 import sys
 import warnings
 from collections.abc import Sequence
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cz_gym.baselines.registry import find_controller
 from cz_gym.body.process import BODY
 from cz_gym.config import Config, make_config
 from cz_gym.crystal.parameters import STAGES, named
@@ -28,8 +28,6 @@ from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.units import MINUTE
 
 Action = npt.NDArray[np.float32]
-CONTROLLERS = "cz_gym.baselines.registry:find_controller"
-"""Function that finds a controller, looked up by name because this package imports no controller."""
 SIZE = (960, 720)
 """Width and height of the picture [px]."""
 NO_DISPLAY = "no display: a crystal is pulled by hand in a window; set DISPLAY or WAYLAND_DISPLAY"
@@ -83,12 +81,12 @@ def score(config: Config, seed: int, actions: Sequence[Action], failed: bool) ->
         config = replace(config, horizon=len(actions) * config.control_interval)
     direct = replace(config, action="direct")
     name, whose = ("compensated", "the compensated") if config.process == CRYSTAL else ("paper", "the paper's")
-    rival = pkgutil.resolve_name(CONTROLLERS)(name, config.process).make(direct)
+    rival = find_controller(name, config.process).make(direct)
     results = []
     for policy, own in ((Playback(actions), config), (rival, direct)):
-        found = metrics(rollout(policy, own, [seed]))
-        lost = ", failed" if found.failure_rate[0] else ""
-        results.append(f"RMSE {found.rmse_mm[0]:.3f} mm, return {found.return_[0]:,.0f}{lost}")
+        figures = metrics(rollout(policy, own, [seed]))
+        lost = ", failed" if figures.failure_rate[0] else ""
+        results.append(f"RMSE {figures.rmse_mm[0]:.3f} mm, return {figures.return_[0]:,.0f}{lost}")
     crystal = f"{config.scenario.name}, crystal {seed}, {config.horizon / MINUTE:.0f} min"
     return f"{crystal}: by hand {results[0]}; by {whose} controller {results[1]}"
 
