@@ -137,13 +137,13 @@ class DifferentiableBatch:
         batch, out = self._batch, self._copied()
         slots = batch.memory.slots
         held = np.stack([slots["Q_d"], slots["dT_i"]], axis=1)
-        active = self.grows & (batch.memory.slots["k"] < batch.clock.steps)
+        active = self.grows & (batch.memory.slots["k"] < batch.fixed.steps)
         batch.step(given, out, active)
         self.grows = active & ~out.terminated
         self._out = out
         self._look()
         jacobian = self._jacobians.new()
-        step = (held, batch.actions, self.grows, batch.clock, batch.drives)
+        step = (held, batch.actions, self.grows, batch.fixed, batch.drives)
         self._tangents(batch.memory, before, *step, self._work, jacobian, 0, n)
         info = out.info[:, :n]
         cost = np.where(self.grows, info[self._costs], 0.0).T
@@ -162,7 +162,7 @@ class DifferentiableBatch:
         self._state = self._now()
         if self._moves or first:
             shown, batch = self._shows.new(), self._batch
-            self._shown(batch.memory, batch.scales.measured, batch.clock.interval, shown, 0, len(shown))
+            self._shown(batch.memory, batch.scales.measured, batch.fixed.interval, shown, 0, len(shown))
             shown[~self.grows[: len(shown)]] = 0.0  # those of a lost crystal may be infinite
             self.measured_by_state = shown if self._moves else shown[0]
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from cz_gym.baselines.registry import find_controller
 from cz_gym.evaluation.cluster import on_cluster
-from cz_gym.evaluation.protocol import find_row
+from cz_gym.evaluation.protocol import find_case
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.runner import Task, measure
 from cz_gym.support.atomic_files import check_writable, write_files
@@ -40,7 +40,7 @@ def timed(address: str, function: Callable[[Any], Any], tasks: Sequence[Any]) ->
 
 def tasks_of(crystals: int, cache: Path) -> list[Task]:
     """Every controller on every scenario."""
-    pairs = product(map(find_controller, CONTROLLERS), map(find_row, SCENARIOS))
+    pairs = product(map(find_controller, CONTROLLERS), map(find_case, SCENARIOS))
     return [Task(contender, row, crystals, cache) for contender, row in pairs]
 
 

@@ -18,7 +18,7 @@ from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
 from cz_gym.evaluation.contender import GROUPS, PLANT, REWARD, STATE, Contender, agent
 from cz_gym.evaluation.files import read_results, to_json
-from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, Row, contract_hash
+from cz_gym.evaluation.protocol import CASES, TEST_SEEDS, Case, contract_hash
 from cz_gym.evaluation.report.markdown import summary
 from cz_gym.evaluation.report.tables import RMSE
 from cz_gym.evaluation.report.tables import markdown as table
@@ -37,13 +37,13 @@ HEADS = ("budget", "place", "agent", "told", "training seeds", "claimed RMSE [mm
 TOLD = {GROUPS[REWARD]: "nothing", GROUPS[STATE]: "state, in training", GROUPS[PLANT]: "plant, in training"}
 """What an agent was told, by the heading of its group."""
 Claims = Mapping[str, tuple[float, str]]
-"""RMSE [mm] on the first row, and the contract, that each submission claims."""
+"""RMSE [mm] on the first case, and the contract, that each submission claims."""
 
 
-def random_rows(first_seed: int) -> list[Row]:
+def random_rows(first_seed: int) -> list[Case]:
     """The benchmark's rows of several crystals, from this seed on."""
-    random = (row for row in ROWS if row.default and not find_scenario(row.scenario).deterministic)
-    return [replace(row, first_seed=first_seed) for row in random]
+    random = (case for case in CASES if case.default and not find_scenario(case.scenario).deterministic)
+    return [replace(case, first_seed=first_seed) for case in random]
 
 
 def budget(contender: Contender) -> str:
@@ -53,19 +53,19 @@ def budget(contender: Contender) -> str:
 
 
 def submission(folder: Path) -> tuple[Contender, tuple[float, str]]:
-    """The agent of a folder, and its claim: RMSE on test crystals of the first row, and contract."""
+    """The agent of a folder, and its claim: RMSE on test crystals of the first case, and contract."""
     files = sorted(folder.glob("*.onnx"))
     if not files:
         raise CzError(f"{folder}: no agent file (*.onnx)")
     claimed = folder / "benchmark.json"
     results, contract = read_results(claimed, ["rmse_mm"])
-    if folder.name not in results.get(ROWS[0].name, {}):
-        raise CzError(f"{claimed}: no results of {folder.name!r} on {ROWS[0].name}")
+    if folder.name not in results.get(CASES[0].name, {}):
+        raise CzError(f"{claimed}: no results of {folder.name!r} on {CASES[0].name}")
     contender = agent(folder.name, [OnnxPolicy.load(file) for file in files], own=True)
-    return contender, (results[ROWS[0].name][folder.name]["rmse_mm"].mean, contract)
+    return contender, (results[CASES[0].name][folder.name]["rmse_mm"].mean, contract)
 
 
-def page(results: Sequence[Result], claims: Claims, rows: Sequence[Row]) -> str:
+def page(results: Sequence[Result], claims: Claims, rows: Sequence[Case]) -> str:
     """The leaderboard in Markdown: of each budget its agents by their mean RMSE here; losses and claims beside it."""
     here = {sample.name: sample.contender for sample in results[0].samples if sample.name in claims}
 

@@ -8,7 +8,7 @@ from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.registry import find_controller
 from cz_gym.baselines.tuning.values import with_values
 from cz_gym.evaluation.contender import Contender
-from cz_gym.evaluation.protocol import find_row
+from cz_gym.evaluation.protocol import find_case
 from cz_gym.evaluation.results import Result, Sample, summarise
 from cz_gym.evaluation.rollout import Rollout, rollout
 
@@ -41,7 +41,7 @@ def result_of(
 
     The last is shown as an agent of that name, trained with the given seeds, and meets ``fewer`` crystals less.
     """
-    row, samples, runs = find_row(name), [], {}
+    row, samples, runs = find_case(name), [], {}
     config, seeds = row.config(), row.seeds(3)
     for who in names:
         learned = who == names[-1]

@@ -13,7 +13,7 @@ from cz_gym.errors import CzError
 from cz_gym.evaluation import user_code
 from cz_gym.evaluation.contender import Contender, agent
 from cz_gym.evaluation.files import check_targets, write
-from cz_gym.evaluation.protocol import CRYSTAL_ROWS, ENVIRONMENTS, SLOW_EPISODES, Row, find_row
+from cz_gym.evaluation.protocol import CRYSTAL_CASES, ENVIRONMENTS, SLOW_EPISODES, Case, find_case
 from cz_gym.evaluation.report.markdown import terminal
 from cz_gym.evaluation.runner import check_agents, is_cached, run
 from cz_gym.machine.puller import chosen_puller
@@ -64,7 +64,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     add("--controller", action="append", default=[], metavar="FILE.py:NAME", help=own)
     own = "scenario of your own, in place of others; or a log's disturbances, FILE.csv (identify --series)"
     add("--scenario", action="append", default=[], metavar="FILE.py:NAME", help=own)
-    parser.add_puller("every row runs on it, with the controllers that are designed for it")
+    parser.add_puller("every case runs on it, with the controllers that are designed for it")
     about = "largest deviation of the diameter that is no scrap, in the report for --puller [mm] (1)"
     add("--tolerance", type=float, metavar="MM", help=about)
     add("--slow", action="store_true", help=f"slow controllers too, on 50 episodes; resumed from {shown(CACHE)}")
@@ -112,15 +112,15 @@ def registered(arguments: argparse.Namespace) -> tuple[Contender, ...]:
 
 def benchmark(arguments: argparse.Namespace, command: str) -> int:
     """Check the arguments, run the benchmark, write and print the results."""
-    rows = rows_of(arguments)
-    contenders = contenders_of(arguments, rows)
-    smaller = is_partial(arguments, contenders, rows)
+    cases = cases_of(arguments)
+    contenders = contenders_of(arguments, cases)
+    smaller = is_partial(arguments, contenders, cases)
     check_targets(arguments.out, arguments.json, smaller, arguments.overwrite)
     if arguments.out is not None:  # a missing package is named before the work, not after it
         import matplotlib  # noqa: F401
         import plotly  # noqa: F401
-    bounds = None if arguments.puller or rows[0].process == CRYSTAL else BOUNDS
-    results = run(contenders, rows, arguments.episodes, CACHE, bounds, arguments.quiet, arguments.cluster)
+    bounds = None if arguments.puller or cases[0].process == CRYSTAL else BOUNDS
+    results = run(contenders, cases, arguments.episodes, CACHE, bounds, arguments.quiet, arguments.cluster)
     renewed = not smaller and arguments.out and arguments.out.resolve() == folder_of(arguments)
     quoted = (README, CRYSTAL_PAGE) if renewed else ()
     write(arguments.out, arguments.json, results, command, quoted)
@@ -135,21 +135,21 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     return 0
 
 
-def rows_of(arguments: argparse.Namespace) -> list[Row]:
-    """Scenarios that the command line asks for, as rows of the protocol."""
+def cases_of(arguments: argparse.Namespace) -> list[Case]:
+    """Scenarios that the command line asks for, as cases of the protocol."""
     known = ENVIRONMENTS[arguments.env]
-    graded = arguments.puller and known is not CRYSTAL_ROWS
+    graded = arguments.puller and known is not CRYSTAL_CASES
     if arguments.tolerance is not None and not (graded and 0.0 < arguments.tolerance <= 50.0):
         raise CzError(f"--tolerance {arguments.tolerance:g} must be up to 50 mm, beside --puller FILE.toml, of Cz-v0")
-    names = arguments.scenarios or [row.name for row in known if row.default and not arguments.scenario]
-    rows = [*(find_row(name, known) for name in names), *map(user_code.row, arguments.scenario)]
-    user_code.check_apart([row.name for row in rows], "scenario")
+    names = arguments.scenarios or [case.name for case in known if case.default and not arguments.scenario]
+    cases = [*(find_case(name, known) for name in names), *map(user_code.case, arguments.scenario)]
+    user_code.check_apart([case.name for case in cases], "scenario")
     puller = chosen_puller(arguments.puller)
     tolerance = 0.5 * MM * (arguments.tolerance or 1.0) if graded else None
-    return [replace(row, puller=puller, tolerance=tolerance, process=known[0].process) for row in rows]
+    return [replace(case, puller=puller, tolerance=tolerance, process=known[0].process) for case in cases]
 
 
-def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Contender]:
+def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[Contender]:
     """Controllers and agents that the command line asks for, classical controllers first; CzError for unknown ones.
 
     Those of the user's files always take part, shipped agents by default if no agent is given, slow controllers if
@@ -162,7 +162,7 @@ def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Co
     user_code.check_apart([*names, *shipped, *new, *(each.name for each in own)], "controller")
 
     def may_run(each: Contender) -> bool:
-        return not each.slow or arguments.slow or is_cached(each, rows, arguments.episodes, CACHE)
+        return not each.slow or arguments.slow or is_cached(each, cases, arguments.episodes, CACHE)
 
     wanted, agents = arguments.controllers, list(given) or ([] if arguments.puller else shipped)
     if not wanted and arguments.puller:
@@ -183,7 +183,7 @@ def contenders_of(arguments: argparse.Namespace, rows: Sequence[Row]) -> list[Co
             raise CzError(f"{each.name!r} is slow: add --slow to run it on the first {SLOW_EPISODES} episodes")
     files = {name: shipped_seeds(name) for name in shipped if name in wanted and name not in given}
     chosen += [*given.values(), *(agent(name, [*map(OnnxPolicy.load, some)]) for name, some in files.items())]
-    check_agents(chosen, rows)
+    check_agents(chosen, cases)
     if not (chosen or own):
         raise CzError("no controller takes part: name some with --controllers")
     return [*chosen, *own]
@@ -200,11 +200,11 @@ def given_agents(arguments: argparse.Namespace) -> dict[str, Contender]:
     return {name: agent(name, some, own=True) for name, some in policies.items()}
 
 
-def is_partial(arguments: argparse.Namespace, contenders: Sequence[Contender], rows: Sequence[Row]) -> bool:
+def is_partial(arguments: argparse.Namespace, contenders: Sequence[Contender], cases: Sequence[Case]) -> bool:
     """Whether the run holds less than the default one, or something of the user's own."""
     usual = {each.name for each in registered(arguments) if each.default and not each.slow}
     usual |= set(shipped_names(arguments.env))
-    usual_rows = {row for row in ENVIRONMENTS[arguments.env] if row.default}
-    missing = usual - {each.name for each in contenders} or usual_rows - set(rows)
+    usual_cases = {case for case in ENVIRONMENTS[arguments.env] if case.default}
+    missing = usual - {each.name for each in contenders} or usual_cases - set(cases)
     own = arguments.agent or arguments.controller or arguments.scenario or arguments.puller
     return bool(arguments.episodes < EPISODES or missing or own)

@@ -22,7 +22,7 @@ from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 _PRINTED = 16
 
 
-class Row(NamedTuple):
+class SetPoints(NamedTuple):
     """The set points at a length, in the units that people read; arrays along the crystal."""
 
     length_mm: Any
@@ -40,7 +40,7 @@ class Row(NamedTuple):
     crucible_lift_mm_per_min: Any
 
 
-def set_points(puller: PullerFile) -> Row:
+def set_points(puller: PullerFile) -> SetPoints:
     """The recipe of a puller, a value a row of its table; CzError, with the length, for what cannot be grown."""
     config = make_config(process=CRYSTAL, puller=puller, stage="whole")
     p, table = nominal_recipe(config.parameters._replace(**dict.fromkeys(CRYSTAL.apart, 0.0)), config.meniscus)
@@ -48,25 +48,25 @@ def set_points(puller: PullerFile) -> Row:
     inside = slice(recipe.MARGIN, recipe.ROWS - recipe.MARGIN)
     r, slope, v_g = (np.array(column) for column in zip(*(shape_at(each, p, Episode()) for each in L), strict=True))
     level = (p.M_0 - at.M_s - at.M_men) / (p.rho_l * np.pi * p.R_cr**2)
-    columns = Row(
+    columns = SetPoints(
         L / MM, (at.t - at.t[recipe.MARGIN]) / MINUTE, r / MM,
         np.degrees(np.arctan(slope)).round(9) + 0.0, v_g / MM_PER_MIN,
         at.v_p / MM_PER_MIN, at.Q_H / KILO, at.T_1, at.T_b - p.T_m, at.h_c / MM, (r + at.ring) / MM, at.M_s,
         -np.gradient(level, at.t) / MM_PER_MIN,
     )  # fmt: skip
-    return Row(*(column[inside] for column in columns))
+    return SetPoints(*(column[inside] for column in columns))
 
 
-def to_csv(rows: Row) -> str:
+def to_csv(rows: SetPoints) -> str:
     """The set points as comma-separated values, one line a length."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(Row._fields)
+    writer.writerow(SetPoints._fields)
     writer.writerows([f"{value:.6g}" for value in row] for row in zip(*rows, strict=True))
     return text.getvalue()
 
 
-def draw(rows: Row, title: str) -> bytes:
+def draw(rows: SetPoints, title: str) -> bytes:
     """Picture of the set points: the crystal's outline, then drives and temperatures, as PNG."""
     from cz_gym.evaluation.report.canvas import canvas, png
 

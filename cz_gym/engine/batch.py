@@ -33,7 +33,7 @@ from cz_gym.process import NO_OPERATING_POINT, scales
 
 from .buffers import BufferPool
 from .kernels import build_kernels
-from .layout import Clock, Memory, ObservationScales, Out, info_width, slot_type
+from .layout import Fixed, ObservationScales, Out, SlotMemory, info_width, slot_type
 
 SLOTS_PER_THREAD, SLOTS_AT_ONCE = 256, 128
 """Least slots per thread in a step, and slots that a thread takes at once."""
@@ -81,7 +81,7 @@ class Batch:
         self.kernels = build_kernels(process, config.meniscus)
         points = math.ceil(config.horizon / GRID) + 1
         series = series_table(config.scenario.scenarios)
-        self.clock = Clock(config.control_interval, config.steps, points, config.radius_limit, config.weights, series)
+        self.fixed = Fixed(config.control_interval, config.steps, points, config.radius_limit, config.weights, series)
         self.drives = drives_of(config.action, config.control_interval, *config.ranges[::-1])
         self.channels = len(observations(process)["history" if config.observation == "history" else "measured"])
         shows_state = config.observation == "state" or (everything and config.observation == "history")
@@ -96,7 +96,7 @@ class Batch:
         oldest_age = max(MAX_LATENCY, MAX_DEAD_TIME)
         frames = math.ceil(oldest_age / interval) + math.ceil((oldest_age + interval) / GRID) + 2
         slots = np.zeros(num_envs, slot_type(process))
-        self.memory = Memory(
+        self.memory = SlotMemory(
             slots,
             slots.view(np.float64).reshape(num_envs, -1),
             np.zeros((num_envs, depth, process.lagged)),
@@ -113,7 +113,7 @@ class Batch:
         self._images = BufferPool((num_envs, *IMAGE) if self._camera else (num_envs, 0, 0, 0), np.uint8)
         self._infos = BufferPool((len(process.info), info_width(num_envs)), np.float64)
         out, which, keys = self.new_out(), np.zeros(1, np.int64), np.zeros((1, 2), np.uint64)
-        stepped = (self.memory, self.actions, self._all, self.clock, self.drives, self.scales, out, 0, 1)
+        stepped = (self.memory, self.actions, self._all, self.fixed, self.drives, self.scales, out, 0, 1)
         drawn = self._drawing(which, keys, self._lots, out)
         self._step, self._draw = entry(self.kernels.step, stepped), entry(self.kernels.draw, (*drawn, 0, 1))
         threads = threads or os.cpu_count() or 1
@@ -148,7 +148,7 @@ class Batch:
     def bound_step(self, actions: npt.NDArray[np.float64], out: Out) -> Any:
         """``step`` of all slots, bound to these arrays: it is called without arguments."""
         n = self.num_envs
-        step = partial(self._step, self.memory, actions, self._all, self.clock, self.drives, self.scales, out, 0, n)
+        step = partial(self._step, self.memory, actions, self._all, self.fixed, self.drives, self.scales, out, 0, n)
         if not self._camera:
             return step
 
@@ -188,7 +188,7 @@ class Batch:
 
     def _drawing(self, which: Any, keys: Any, lots: ScenarioTable, out: Out) -> tuple[Any, ...]:
         """Arguments of the compiled draw, without the range of slots."""
-        return self.memory, which, keys, lots, self._parameters, self.clock, self.scales, out
+        return self.memory, which, keys, lots, self._parameters, self.fixed, self.scales, out
 
     def step(self, actions: npt.ArrayLike, out: Out, active: npt.NDArray[np.bool_] | None = None) -> int:
         """Advance the active slots by one control interval; actions of shape (num_envs, 2), not NaN.
@@ -198,14 +198,14 @@ class Batch:
         if actions is not self.actions:
             self.actions[:] = actions
         active = self._all if active is None else active
-        arguments = (self.memory, self.actions, active, self.clock, self.drives, self.scales, out)
+        arguments = (self.memory, self.actions, active, self.fixed, self.drives, self.scales, out)
         ended: int = sum(self._run(self._step, arguments, self.num_envs, SLOTS_PER_THREAD, SLOTS_AT_ONCE))
         self._photograph(out, active)
         return ended
 
     def advance(self, rings: npt.NDArray[np.float64]) -> None:
         """Advance drives and plant and write the rings [m], nothing else: the reference for the speed of a step."""
-        arguments = (self.memory, self.actions, self._all, self.clock, self.drives, rings)
+        arguments = (self.memory, self.actions, self._all, self.fixed, self.drives, rings)
         self._run(self.kernels.plant, arguments, self.num_envs, SLOTS_PER_THREAD, SLOTS_AT_ONCE)
 
     def _run(self, loop: Any, arguments: tuple[Any, ...], count: int, least: int, share: int = 1) -> list[Any]:
@@ -251,8 +251,8 @@ class Batch:
             array = getattr(state, name)
             if not isinstance(array, np.ndarray) or (array.dtype, array.shape) != (rows.dtype, rows.shape[1:]):
                 raise CzError(f"this state was saved by another version of cz_gym, or damaged: its {name} does not fit")
-        if not 0 <= int(state.slot["k"]) <= self.clock.steps:
-            raise CzError(f"this state is damaged: sample {int(state.slot['k'])} of {self.clock.steps}")
+        if not 0 <= int(state.slot["k"]) <= self.fixed.steps:
+            raise CzError(f"this state is damaged: sample {int(state.slot['k'])} of {self.fixed.steps}")
 
     def restore(self, which: Sequence[int], states: Sequence[SlotState], out: Out) -> None:
         """Continue slots from states that passed :meth:`check`; write their last samples into ``out``."""
@@ -260,7 +260,7 @@ class Batch:
             for name, rows in zip(_SAVED, self._saved(), strict=True):
                 rows[i] = getattr(state, name)
             self.scenarios[i] = state.scenario
-        self.kernels.show(self.memory, np.array(which, np.int64), self.clock, self.scales, out, 0, len(which))
+        self.kernels.show(self.memory, np.array(which, np.int64), self.fixed, self.scales, out, 0, len(which))
         if self._camera:
             self._photograph(out, np.isin(np.arange(self.num_envs), which))
 

@@ -45,10 +45,10 @@ def _begin(slot: Any, interval: Any, model: Any) -> None:
 
 
 @inlined
-def _sample(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, model: Any) -> Any:
+def _sample(memory: Any, i: Any, fresh: Any, fixed: Any, scales: Any, out: Any, model: Any) -> Any:
     """Read the sensors of slot i if ``fresh``, write observation and info, and return the terms of the step's cost."""
     process, slot = model.process, memory.slots[i]
-    t, x = slot.k * clock.interval, labelled(process.State, slot.x)
+    t, x = slot.k * fixed.interval, labelled(process.State, slot.x)
     seen = process.see(x, slot.puller, model.meniscus)
     if fresh:
         camera, pyrometer = sample_noise(slot.episode, slot.streams)
@@ -61,11 +61,11 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, 
     write_channels(measured, scales.measured, row)
     if memory.history.shape[1] > 0:
         if fresh:
-            remember(slot, memory.history[i], clock.interval, row, process)
+            remember(slot, memory.history[i], fixed.interval, row, process)
         recall(slot, measured, memory.history[i], scales, row, process)
     if out.state.shape[1] > 0:
         write_channels(process.true_state(slot, measured, t), scales.state, out.state[i])
-    cost = process.cost_terms(process.charged(x, u, before, extra, slot, t), clock.weights)
+    cost = process.cost_terms(process.charged(x, u, before, extra, slot, t), fixed.weights)
     if slot.k == 0:
         cost = along(cost, -1.0, cost)
     if scales.everything:
@@ -80,8 +80,8 @@ def _sample(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, 
     return cost
 
 
-def _read(memory: Any, i: Any, fresh: Any, clock: Any, scales: Any, out: Any, model: Any) -> None:
-    _sample(memory, i, fresh, clock, scales, out, model)
+def _read(memory: Any, i: Any, fresh: Any, fixed: Any, scales: Any, out: Any, model: Any) -> None:
+    _sample(memory, i, fresh, fixed, scales, out, model)
     out.reward[i] = 0.0
     out.terminated[i] = out.truncated[i] = False
 
@@ -118,17 +118,17 @@ class Kernels(NamedTuple):
     """The compiled loops for one process on one meniscus model."""
 
     step: Any
-    """``step(memory, actions, active, clock, drives, scales, out, start, stop)``: one control interval of the active
+    """``step(memory, actions, active, fixed, drives, scales, out, start, stop)``: one control interval of the active
     slots; returns how many episodes ended."""
     draw: Any
-    """``draw(memory, which, keys, lots, parameters, clock, scales, out, start, stop)``: new episodes, each
+    """``draw(memory, which, keys, lots, parameters, fixed, scales, out, start, stop)``: new episodes, each
     from its key, for the slots ``which[start:stop]``, with their first sample; returns -1, or a slot whose
     :data:`TRIES` draws gave no puller with an operating point."""
     show: Any
-    """``show(memory, which, clock, scales, out, start, stop)``: writes the last sample of the slots
+    """``show(memory, which, fixed, scales, out, start, stop)``: writes the last sample of the slots
     ``which[start:stop]`` again."""
     plant: Any
-    """``plant(memory, actions, active, clock, drives, rings, start, stop)``: drives, plant and ring of all slots alone,
+    """``plant(memory, actions, active, fixed, drives, rings, start, stop)``: drives, plant and ring of all slots alone,
     to measure speed against."""
 
 
@@ -138,15 +138,15 @@ def build_kernels(process: Process, meniscus: MeniscusModel) -> Kernels:
     model = model_of(process, meniscus)
 
     def step(
-        memory: Any, actions: Any, active: Any, clock: Any, drives: Any, scales: Any, out: Any, start: int, stop: int
+        memory: Any, actions: Any, active: Any, fixed: Any, drives: Any, scales: Any, out: Any, start: int, stop: int
     ) -> int:
         ended, remembers = 0, memory.history.shape[1] > 0
         for first in range(start, stop, LANES):
             count = min(LANES, stop - first)
             for i in range(first, first + count):
                 if active[i]:
-                    drive(memory.slots[i], actions[i, 0], actions[i, 1], drives, clock.interval, model.process)
-            advance(memory, active, first, count, clock, model)
+                    drive(memory.slots[i], actions[i, 0], actions[i, 1], drives, fixed.interval, model.process)
+            advance(memory, active, first, count, fixed, model)
             if scales.everything:
                 _fetch_info(out.info, first + LANES, model)
             for i in range(first, first + count):
@@ -156,8 +156,8 @@ def build_kernels(process: Process, meniscus: MeniscusModel) -> Kernels:
                 if not active[i]:
                     continue
                 slot, outcome = memory.slots[i], memory.slots[i].over
-                cost = _sample(memory, i, True, clock, scales, out, model)
-                ends = slot.k >= clock.steps
+                cost = _sample(memory, i, True, fixed, scales, out, model)
+                ends = slot.k >= fixed.steps
                 out.reward[i] = model.process.reward(cost, outcome != LOST)
                 out.terminated[i] = outcome != GROWS
                 out.truncated[i] = outcome == GROWS and ends
@@ -166,7 +166,7 @@ def build_kernels(process: Process, meniscus: MeniscusModel) -> Kernels:
         return ended
 
     def draw(
-        memory: Any, which: Any, keys: Any, lots: Any, parameters: Any, clock: Any, scales: Any, out: Any,
+        memory: Any, which: Any, keys: Any, lots: Any, parameters: Any, fixed: Any, scales: Any, out: Any,
         start: int, stop: int,
     ) -> int:  # fmt: skip
         impossible = -1
@@ -189,23 +189,23 @@ def build_kernels(process: Process, meniscus: MeniscusModel) -> Kernels:
             episode = draw_episode(record, slot.streams, slot.freezes)
             for number in range(len(episode)):
                 numbers[model.constants + number] = episode[number]
-            _begin(slot, clock.interval, model)
+            _begin(slot, fixed.interval, model)
             memory.frames[i, :, 3] = slot.Q_H
-            _sample_alone(memory, i, True, clock, scales, out, model)
+            _sample_alone(memory, i, True, fixed, scales, out, model)
         return impossible
 
-    def show(memory: Any, which: Any, clock: Any, scales: Any, out: Any, start: int, stop: int) -> None:
+    def show(memory: Any, which: Any, fixed: Any, scales: Any, out: Any, start: int, stop: int) -> None:
         for at in range(start, stop):
-            _sample_alone(memory, which[at], False, clock, scales, out, model)
+            _sample_alone(memory, which[at], False, fixed, scales, out, model)
 
     def plant(
-        memory: Any, actions: Any, active: Any, clock: Any, drives: Any, rings: Any, start: int, stop: int
+        memory: Any, actions: Any, active: Any, fixed: Any, drives: Any, rings: Any, start: int, stop: int
     ) -> None:
         for first in range(start, stop, LANES):
             count = min(LANES, stop - first)
             for i in range(first, first + count):
-                drive(memory.slots[i], actions[i, 0], actions[i, 1], drives, clock.interval, model.process)
-            advance(memory, active, first, count, clock, model)
+                drive(memory.slots[i], actions[i, 0], actions[i, 1], drives, fixed.interval, model.process)
+            advance(memory, active, first, count, fixed, model)
             for i in range(first, first + count):
                 _fetch_slot(memory.numbers, i + LANES, model)
                 x = labelled(process.State, memory.slots[i].x)

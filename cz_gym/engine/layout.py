@@ -132,8 +132,8 @@ def model_of(process: Process, meniscus: MeniscusModel) -> Model:
     )  # fmt: skip
 
 
-class Clock(NamedTuple):
-    """Time base of the slots, and the limit of their radius."""
+class Fixed(NamedTuple):
+    """What all slots share and no step changes: time base, radius limit, weights of the cost, logged series."""
 
     interval: float
     """Control interval [s]."""
@@ -149,7 +149,7 @@ class Clock(NamedTuple):
     """Load [W] and fluctuation [K] from logs, one row a scenario, shape (scenarios, points, 2); no points: none."""
 
 
-class Memory(NamedTuple):
+class SlotMemory(NamedTuple):
     """The memory of the slots, one row per slot."""
 
     slots: Any

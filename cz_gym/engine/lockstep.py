@@ -86,15 +86,15 @@ def _integrate(lanes: Any, ends: Any, count: Any, model: Any) -> None:
 
 
 @jittable
-def _judge(slot: Any, frames: Any, lanes: Any, ends: Any, lane: Any, clock: Any, model: Any) -> Any:
+def _accept_substep(slot: Any, frames: Any, lanes: Any, ends: Any, lane: Any, fixed: Any, model: Any) -> Any:
     """Accept or reject a substep; return whether the slot needs another one."""
     process, m = model.process, model.meniscus
     dt, upto = lanes[model.dt_at, lane], lanes[model.dt_at + 1, lane]
     x, u = column(process.State, lanes, model.constants, lane), column(Inputs, lanes, model.u_at, lane)
     d, new = column(process.Disturbance, lanes, model.d_at, lane), column(process.State, ends, 0, lane)
-    new, slot.over = process.accept(slot, x, new, u, d, upto, dt, clock.radius_limit, m)
+    new, slot.over = process.accept(slot, x, new, u, d, upto, dt, fixed.radius_limit, m)
     set_column(process.State, new, lanes, model.constants, lane)
-    more = upto < (slot.k + 1) * clock.interval - _EPS
+    more = upto < (slot.k + 1) * fixed.interval - _EPS
     if more and slot.episode.latency > 0.0:
         seen = process.see(new, slot.puller, m)
         photograph(slot, frames, upto, seen.reading, seen.h_c)
@@ -102,7 +102,7 @@ def _judge(slot: Any, frames: Any, lanes: Any, ends: Any, lane: Any, clock: Any,
 
 
 @jittable
-def advance(memory: Any, active: Any, first: Any, count: Any, clock: Any, model: Any) -> None:
+def advance(memory: Any, active: Any, first: Any, count: Any, fixed: Any, model: Any) -> None:
     """Integrate the active ones of up to :data:`LANES` slots over one control interval, split at the 5 s grid.
 
     A slot is over if its crystal does not grow on.
@@ -111,21 +111,21 @@ def advance(memory: Any, active: Any, first: Any, count: Any, clock: Any, model:
     going, slow, lanes, ends = 0, False, scratch(model.lane_rows, LANES), scratch(model.states, LANES)
     for lane in range(count):
         i = first + lane
-        _begin(memory.slots[i], memory.numbers[i], lanes, lane, clock.interval, model)
+        _begin(memory.slots[i], memory.numbers[i], lanes, lane, fixed.interval, model)
         lanes[goes, lane] = 1.0 if active[i] else 0.0
         going += 1 if active[i] else 0
         slow = slow or is_slow(memory.slots[i].episode)
     while going > 0:
         for lane in range(count):
             if lanes[goes, lane] > 0.0:
-                _prepare(memory.slots[first + lane], lanes, lane, clock.interval, clock.series, model)
+                _prepare(memory.slots[first + lane], lanes, lane, fixed.interval, fixed.series, model)
         if slow:
-            _heat(memory, first, count, lanes, clock.interval, model)
+            _heat(memory, first, count, lanes, fixed.interval, model)
         _integrate(lanes, ends, count, model)
         for lane in range(count):
             if lanes[goes, lane] > 0.0:
                 i = first + lane
-                if not _judge(memory.slots[i], memory.frames[i], lanes, ends, lane, clock, model):
+                if not _accept_substep(memory.slots[i], memory.frames[i], lanes, ends, lane, fixed, model):
                     lanes[goes, lane] = 0.0
                     going -= 1
     for lane in range(count):

@@ -242,7 +242,7 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, ...]
     ``gather(memory, state, start, stop)`` writes the differentiable states.
     ``shown(memory, per_scale, interval, by_state, start, stop)`` writes the derivatives of "measured" by them, shape
     (n, channels, states).
-    ``tangents(memory, state, held, actions, grows, clock, drives, work, jacobian, start, stop)`` writes the derivatives
+    ``tangents(memory, state, held, actions, grows, fixed, drives, work, jacobian, start, stop)`` writes the derivatives
     of the step that led from ``state`` to where the slots are now, shape (n, rows, states + actions); zero for a slot
     that does not grow. ``held``, shape (n, 2), is Q_d [W] and dT_i [K] before the step, which may be 5 s long: those of
     its first substep if a point of the grid lies inside.
@@ -266,7 +266,7 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, ...]
             _shown_by(by_state[i], slot, slot.k * interval, per_scale, model)
 
     def tangents(
-        memory: Any, state: Any, held: Any, actions: Any, grows: Any, clock: Any, drives: Any, work: Any,
+        memory: Any, state: Any, held: Any, actions: Any, grows: Any, fixed: Any, drives: Any, work: Any,
         jacobian: Any, start: int, stop: int,
     ) -> None:  # fmt: skip
         ring, reading, seen_by = model.ring, model.ring + 1, scratch(4, model.states)
@@ -275,7 +275,7 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, ...]
             J[:, :] = 0.0
             if not grows[i]:
                 continue
-            slot, dt = memory.slots[i], clock.interval
+            slot, dt = memory.slots[i], fixed.interval
             p, e = slot.puller, slot.episode
             begun, before = column(process.State, state.T, 0, i), column(Inputs, state.T, model.states, i)
             action, nominal = Inputs(actions[i, 0], actions[i, 1]), _nominal_of(state.T, i, slot, model)
@@ -309,7 +309,7 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, ...]
                 if seen_by[0, row] != 0.0:
                     for j in range(model.columns):
                         J[ring, j] += seen_by[0, row] * J[row, j]
-            _cost_by(J, slot, slot.k * dt, clock.weights, model)
+            _cost_by(J, slot, slot.k * dt, fixed.weights, model)
             # The camera's frame is of now, of the grid point inside the step, or of the sample before.
             fresh, between = slot.k_seen == slot.k, inside and at <= slot.k * dt - e.latency + _EPS
             for j in range(model.columns):

@@ -21,7 +21,7 @@ from cz_gym.support.atomic_files import write_files
 
 from .files import EPISODES, read_episodes, software
 from .metrics import metric_names
-from .protocol import Row
+from .protocol import Case
 from .results import BOUND, GAPS, Sample
 from .rollout import Floats
 
@@ -34,11 +34,11 @@ PICTURES = ("camera", "rendering")
 
 
 class SlowEpisodes:
-    """The cached episodes of a slow controller on a row; its policy has a ``hash`` of its settings."""
+    """The cached episodes of a slow controller on a case; its policy has a ``hash`` of its settings."""
 
-    def __init__(self, contender: Contender, row: Row, folder: Path) -> None:
-        config = row.config(contender.observation, contender.action)
-        policy = contender.make(row.design_config(contender.observation, contender.action))
+    def __init__(self, contender: Contender, case: Case, folder: Path) -> None:
+        config = case.config(contender.observation, contender.action)
+        policy = contender.make(case.design_config(contender.observation, contender.action))
         code, versions = code_behind(type(policy).__module__), software(COMPUTING)["packages"]
         parts = [contender.name, policy.hash, code, versions, config.hash, *metric_names()]
         digest = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
@@ -71,17 +71,17 @@ class SlowEpisodes:
         write_files(packed)
 
 
-def earlier_bound(folder: Path, row: Row, samples: Sequence[Sample]) -> Sample | None:
-    """The bound on a row from a folder of benchmark results, which has neither its signals nor its time.
+def earlier_bound(folder: Path, case: Case, samples: Sequence[Sample]) -> Sample | None:
+    """The bound on a case from a folder of benchmark results, which has neither its signals nor its time.
 
-    None unless that bound met the row's first episodes, and a classical controller had the same figures then and now.
+    None unless that bound met the case's first episodes, and a classical controller had the same figures then and now.
     """
     try:
-        earlier = read_episodes(folder / EPISODES, ("seed", *GAPS))[row.name]
+        earlier = read_episodes(folder / EPISODES, ("seed", *GAPS))[case.name]
         (episodes,) = earlier[BOUND]
     except (ValueError, KeyError):
         return None
-    seeds = row.seeds(len(episodes))
+    seeds = case.seeds(len(episodes))
     classical = [sample for sample in samples if sample.name in earlier and not sample.contender.learned]
     agree = [_agree(sample, earlier[sample.name][0]) for sample in classical]
     if episodes[:, 0].tolist() != list(seeds) or not agree or not all(agree):

@@ -80,7 +80,7 @@ def to_json(results: Sequence[Result], command: str) -> str:
     """Return the text of ``benchmark.json``: results, paired differences, tails, verdicts and provenance."""
 
     def each(table: Callable[[Result], Mapping[str, Any]]) -> dict[str, Any]:
-        return {result.row.name: _plain(table(result)) for result in results}
+        return {result.case.name: _plain(table(result)) for result in results}
 
     data = {
         "results": each(lambda result: result.means),
@@ -90,7 +90,7 @@ def to_json(results: Sequence[Result], command: str) -> str:
         "optimality_gap": _gaps(results, "cost"),
         "optimality_gap_radius": _gaps(results, "rmse_mm"),
         "verdicts": {
-            result.row.name: {
+            result.case.name: {
                 agent: {"rival": result.rival, "rmse_mm_difference": _plain(difference), "wins": result.wins(agent)}
                 for agent, difference in result.verdicts.items()
             }
@@ -113,11 +113,11 @@ def _plain(value: Any) -> Any:
 
 def _gaps(results: Sequence[Result], metric: str) -> dict[str, Any]:
     """The gaps in one metric, of the scenarios that have any."""
-    by_row = {
-        result.row.name: {name: _plain(gaps[metric]) for name, gaps in result.gaps.items() if metric in gaps}
+    by_case = {
+        result.case.name: {name: _plain(gaps[metric]) for name, gaps in result.gaps.items() if metric in gaps}
         for result in results
     }
-    return {row: gaps for row, gaps in by_row.items() if gaps}
+    return {case: gaps for case, gaps in by_case.items() if gaps}
 
 
 def _paired(result: Result) -> dict[str, Any]:
@@ -129,11 +129,11 @@ def _paired(result: Result) -> dict[str, Any]:
 
 
 def _provenance(results: Sequence[Result], command: str) -> dict[str, Any]:
-    config, contenders = results[0].row.config(), [sample.contender for sample in results[0].samples]
+    config, contenders = results[0].case.config(), [sample.contender for sample in results[0].samples]
     return {
         "command": command,
         **software(PACKAGES),
-        "contract": contract_hash([result.row for result in results]),
+        "contract": contract_hash([result.case for result in results]),
         "plant_hash": config.plant_hash,
         "puller": config.puller.label,
         "parameters": {
@@ -141,25 +141,25 @@ def _provenance(results: Sequence[Result], command: str) -> dict[str, Any]:
         },
         "control_interval_s": config.control_interval,
         "horizon_s": config.horizon,
-        "scenarios": {result.row.name: _crystals(result) for result in results},
+        "scenarios": {result.case.name: _crystals(result) for result in results},
         "controllers": {each.name: {name: getattr(each, name) for name in FACTS} for each in contenders},
         "agents": [asdict(policy.contract) for each in contenders for policy in each.trained],
         "bootstrap": {"resamples": RESAMPLES, "seed": SEED, "paired_against": REFERENCE},
         "gap_measured_from": BOUND,
         "gap_from_cached_episodes": {
-            result.row.name: len(result.earlier_bound.seeds) for result in results if result.earlier_bound
+            result.case.name: len(result.earlier_bound.seeds) for result in results if result.earlier_bound
         },
     }
 
 
 def _crystals(result: Result) -> dict[str, Any]:
-    row, scenario = result.row, result.row.config().sole_scenario
+    case, scenario = result.case, result.case.config().sole_scenario
     return {
         "scenario": scenario.name,
         "hash": scenario.hash,
-        "model": row.model,
-        "control_interval_s": row.control_interval,
-        "meniscus": row.meniscus.name,
+        "model": case.model,
+        "control_interval_s": case.control_interval,
+        "meniscus": case.meniscus.name,
         "first_seed": result.seeds[0],
         "episodes": len(result.seeds),
     }
@@ -177,7 +177,7 @@ def software(packages: Sequence[str]) -> dict[str, Any]:
 def to_csv(results: Sequence[Result]) -> str:
     """Return the text of ``episodes.csv``, one line an episode."""
     rows = (
-        (result.row.name, sample.name, training_seed, seed, *(f"{value:.5g}" for value in values))
+        (result.case.name, sample.name, training_seed, seed, *(f"{value:.5g}" for value in values))
         for result in results
         for sample in result.samples
         for training_seed, episodes in zip(sample.contender.training_seeds or ("",), sample.values, strict=True)

@@ -32,7 +32,7 @@ SLOW_EPISODES = 50
 
 
 @dataclass(frozen=True)
-class Row:
+class Case:
     """A scenario with the settings that the benchmark runs it with."""
 
     name: str
@@ -67,7 +67,7 @@ class Row:
         return self.puller.control_interval if self.interval is None else self.interval
 
     def config(self, observation: str = "measured", action: str = "direct") -> Config:
-        """Return the environment's settings: three hours of this row's scenario, model, interval and meniscus."""
+        """Return the environment's settings: three hours of this case's scenario, model, interval and meniscus."""
         return replace(self.design_config(observation, action), meniscus=self.meniscus)
 
     def design_config(self, observation: str = "measured", action: str = "direct") -> Config:
@@ -97,23 +97,23 @@ _RAMP = (
 )
 _FALL = "the radius reference falls by {} mm within 30 min; nothing else happens"
 
-ROWS: tuple[Row, ...] = (
-    Row(
+CASES: tuple[Case, ...] = (
+    Case(
         "randomized",
         "randomized",
         "unlike pullers, recipe errors, drift, fluctuations, noise: the training distribution",
     ),
-    Row("hard", "hard", "the same families, half as wide again or more"),
-    Row("sensor-fault", "sensor-fault", "randomized with frozen frames, drop-outs and a drifting ring"),
-    Row("puller", "puller", "randomized with latency, ripple, outliers, a wrong ring bias and slow, narrow drives"),
-    Row("hot-zone", "hot-zone", "randomized on hot zones that differ from the design values by up to a factor of two"),
-    Row("paper-ramp-I", "paper-ramp", _RAMP, "I"),
-    Row("paper-ramp-II", "paper-ramp", _RAMP, "II"),
-    Row("reference-a", "reference-a", _FALL.format(2.5), "I"),
-    Row("reference-b", "reference-b", _FALL.format(0.5), "I"),
-    Row("nominal", "nominal", "nothing happens", "I", default=False),
+    Case("hard", "hard", "the same families, half as wide again or more"),
+    Case("sensor-fault", "sensor-fault", "randomized with frozen frames, drop-outs and a drifting ring"),
+    Case("puller", "puller", "randomized with latency, ripple, outliers, a wrong ring bias and slow, narrow drives"),
+    Case("hot-zone", "hot-zone", "randomized on hot zones that differ from the design values by up to a factor of two"),
+    Case("paper-ramp-I", "paper-ramp", _RAMP, "I"),
+    Case("paper-ramp-II", "paper-ramp", _RAMP, "II"),
+    Case("reference-a", "reference-a", _FALL.format(2.5), "I"),
+    Case("reference-b", "reference-b", _FALL.format(0.5), "I"),
+    Case("nominal", "nominal", "nothing happens", "I", default=False),
     *(
-        Row(f"only-{name}", f"only-{name}", f"{what} alone, as wide as in randomized", default=False)
+        Case(f"only-{name}", f"only-{name}", f"{what} alone, as wide as in randomized", default=False)
         for name, what in (
             ("recipe", "errors of the recipe"),
             ("drift", "drift of the hot zone"),
@@ -123,11 +123,11 @@ ROWS: tuple[Row, ...] = (
             ("parameters", "unlike pullers"),
         )
     ),
-    Row("randomized-I", "randomized", "randomized, every puller conducting only: Model I", "I", default=False),
-    Row("randomized-II", "randomized", "randomized, every puller convecting only: Model II", "II", default=False),
-    Row("randomized-2s", "randomized", "randomized, an action every 2 s", default=False, interval=2.0),
-    Row("randomized-10s", "randomized", "randomized, an action every 10 s", default=False, interval=10.0),
-    Row(
+    Case("randomized-I", "randomized", "randomized, every puller conducting only: Model I", "I", default=False),
+    Case("randomized-II", "randomized", "randomized, every puller convecting only: Model II", "II", default=False),
+    Case("randomized-2s", "randomized", "randomized, an action every 2 s", default=False, interval=2.0),
+    Case("randomized-10s", "randomized", "randomized, an action every 10 s", default=False, interval=10.0),
+    Case(
         "randomized-exact",
         "randomized",
         "randomized on the exact Young-Laplace meniscus, which no controller knows of",
@@ -135,7 +135,7 @@ ROWS: tuple[Row, ...] = (
         meniscus=YOUNG_LAPLACE,
     ),
 )
-"""Every row, in the order of tables; families of disturbances alone and variants of randomized run when asked for."""
+"""Every case, in the order of tables; families of disturbances alone and variants of randomized run when asked for."""
 
 
 _GROWN = {
@@ -144,8 +144,8 @@ _GROWN = {
     "tail": "from 50 mm before the tail to its end",
     "whole": "from the neck to the tail's end",
 }
-CRYSTAL_ROWS: tuple[Row, ...] = tuple(
-    Row(
+CRYSTAL_CASES: tuple[Case, ...] = tuple(
+    Case(
         stage if scenario == "randomized" else f"{stage}-{scenario}",
         scenario,
         f"{_GROWN[stage]}, {scenario}",
@@ -157,26 +157,26 @@ CRYSTAL_ROWS: tuple[Row, ...] = tuple(
     for scenario in ("randomized", "hard", "sensor-fault", "puller", "hot-zone", "nominal")
     for stage in STAGES
 )
-"""Every row of ``CzCrystal-v0``: a stage under a scenario's disturbances; those on randomized have the stage's name."""
-ENVIRONMENTS: dict[str, tuple[Row, ...]] = {"Cz-v0": ROWS, "CzCrystal-v0": CRYSTAL_ROWS}
-"""The rows of each environment."""
+"""Every case of ``CzCrystal-v0``: a stage under a scenario's disturbances; on randomized it has the stage's name."""
+ENVIRONMENTS: dict[str, tuple[Case, ...]] = {"Cz-v0": CASES, "CzCrystal-v0": CRYSTAL_CASES}
+"""The cases of each environment."""
 
 
-def find_row(name: str, rows: Sequence[Row] = ROWS) -> Row:
-    """Return the row of that name; CzError names those that exist."""
-    for row in rows:
-        if row.name == ALIASES.get(name, name):
-            return row
-    raise CzError(unknown("scenario", name, [row.name for row in rows]))
+def find_case(name: str, cases: Sequence[Case] = CASES) -> Case:
+    """Return the case of that name; CzError names those that exist."""
+    for case in cases:
+        if case.name == ALIASES.get(name, name):
+            return case
+    raise CzError(unknown("scenario", name, [case.name for case in cases]))
 
 
-def contract_hash(rows: Sequence[Row]) -> str:
-    """The hash of what figures rest on: plant, scenarios, interval, horizon of the random rows; reward and metrics."""
+def contract_hash(cases: Sequence[Case]) -> str:
+    """The hash of what figures rest on: plant, scenarios, interval, horizon of the random cases; reward and metrics."""
     from .crystal_metrics import kind_of
     from .metrics import ALMOST, PULL_WINDOW, names_of
 
-    random = [row.config() for row in rows if not find_scenario(row.scenario).deterministic]
-    configs = random or [row.config() for row in rows]
-    parts = [*sorted(config.hash for config in configs), configs[0].reward_hash, *names_of(kind_of(rows[0].process))]
+    random = [case.config() for case in cases if not find_scenario(case.scenario).deterministic]
+    configs = random or [case.config() for case in cases]
+    parts = [*sorted(config.hash for config in configs), configs[0].reward_hash, *names_of(kind_of(cases[0].process))]
     parts += [str(number) for number in (PULL_WINDOW, PULL_TOLERANCE, TOLERANCE, ALMOST)]
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:12]

@@ -1,4 +1,4 @@
-"""The benchmark's results: samples, which were measured, and for each row the estimates that are computed from them."""
+"""The benchmark's results: samples, which were measured, and for each case the estimates computed from them."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from cz_gym.evaluation.contender import Contender
 
 from .crystal_metrics import measured
 from .metrics import Metrics, names_of, outside
-from .protocol import Row
+from .protocol import Case
 from .rollout import Floats, Rollout
 from .statistics import Estimate, Resamples, cvar, differences, means, optimality_gap, probability_of_improvement
 
@@ -32,7 +32,7 @@ LARGEST_ERRORS = ("crown_max_mm", "tail_max_mm", "max_error_mm")
 
 @dataclass(frozen=True)
 class Sample:
-    """Metrics of a contender on some episodes of a row."""
+    """Metrics of a contender on some episodes of a case."""
 
     contender: Contender
     seeds: tuple[int, ...]
@@ -43,7 +43,7 @@ class Sample:
     example: Any = None
     """Signals of the first episode up to its end, each of shape (steps,), of the first training seed."""
     outside: Floats | None = None
-    """Share of time outside the row's tolerance band [-], shape (training seeds or 1, episodes), if it has one."""
+    """Share of time outside the case's tolerance band [-], shape (training seeds or 1, episodes), if it has one."""
     kind: Any = Metrics
     """Type of its metrics."""
 
@@ -94,9 +94,9 @@ Estimates = Mapping[str, Mapping[str, Estimate]]
 
 @dataclass(frozen=True)
 class Result:
-    """Estimates of all contenders on one row."""
+    """Estimates of all contenders on one case."""
 
-    row: Row
+    case: Case
     samples: tuple[Sample, ...]
     means: Estimates
     """Mean over crystals and training seeds, :data:`SPEED` included."""
@@ -135,8 +135,8 @@ class Result:
         return self.verdicts[agent].ends[0] > 0.0
 
 
-def summarise(row: Row, samples: Sequence[Sample], earlier_bound: Sample | None = None) -> Result:
-    """Means, tails, paired differences, gaps and verdicts of one row.
+def summarise(case: Case, samples: Sequence[Sample], earlier_bound: Sample | None = None) -> Result:
+    """Means, tails, paired differences, gaps and verdicts of one case.
 
     Contenders that met the same episodes share their resamples; two that met different numbers are compared on those
     that both met. ``earlier_bound`` stands in for :data:`BOUND` if that is not among the samples.
@@ -149,7 +149,7 @@ def summarise(row: Row, samples: Sequence[Sample], earlier_bound: Sample | None 
     bound = named.get(BOUND, earlier_bound)
     against = [sample for sample in samples if reference is not None and sample is not reference]
     return Result(
-        row,
+        case,
         tuple(samples),
         {sample.name: _means(sample, resamples) for sample in samples},
         {

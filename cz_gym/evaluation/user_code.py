@@ -16,7 +16,7 @@ from cz_gym.errors import CzError
 from cz_gym.evaluation.contender import Contender
 from cz_gym.support.names import unknown
 
-from .protocol import Row
+from .protocol import Case
 
 
 def load(place: str, kind: str, fits: Callable[[Any, str], bool]) -> tuple[str, Any]:
@@ -48,7 +48,7 @@ def scenarios(text: str) -> Distribution:
     """
 
     def one(name: str) -> Any:
-        return row(name).scenario if ":" in name else name
+        return case(name).scenario if ":" in name else name
 
     if "=" not in text:
         return find_distribution(one(text))
@@ -109,15 +109,15 @@ def _controls(value: Any, module: str) -> bool:
     return acts or (own and inspect.isfunction(value))
 
 
-def row(place: str) -> Row:
-    """Return a row of the scenario at ``FILE.py:NAME``, a :class:`cz_gym.Scenario`, or of a log's series, FILE.csv."""
+def case(place: str) -> Case:
+    """Return a case of the scenario at ``FILE.py:NAME``, a :class:`cz_gym.Scenario`, or of a log's series, FILE.csv."""
     if place.endswith(".csv"):
         scenario = find_scenario(place)
-        return Row(scenario.name, scenario, f"of {place}", default=False, file=place)
+        return Case(scenario.name, scenario, f"of {place}", default=False, file=place)
     _, scenario = load(place, "scenario", lambda value, _: isinstance(value, Scenario) and value.name not in SCENARIOS)
     if not isinstance(scenario, Scenario):
         raise CzError(f"{place}: no scenario: a {type(scenario).__name__}, not a cz_gym.Scenario")
-    return Row(scenario.name, scenario, f"of {place}", default=False, file=place)
+    return Case(scenario.name, scenario, f"of {place}", default=False, file=place)
 
 
 def check_apart(names: Sequence[str], kind: str) -> None:

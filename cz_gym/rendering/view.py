@@ -14,8 +14,8 @@ from cz_gym.process import Process
 from cz_gym.support.names import unknown
 
 from .canvas import MISSING, Frame, available, load
+from .picture import Picture
 from .record import DRAWN, Record, record_for
-from .scene import Scene
 
 MODES = ("human", "rgb_array")
 FPS = 30
@@ -70,7 +70,7 @@ class View:
     def __init__(self, mode: str, width: int, height: int, config: Config) -> None:
         self.mode, self.size, self.config = mode, (width, height), config
         self.record: Record | None = None
-        self._scene: Scene | None = None
+        self._picture: Picture | None = None
         self._window: Any = None
         """Surface of the window; None while there is none."""
 
@@ -95,9 +95,9 @@ class View:
         """
         if self.record is None:
             raise ResetNeeded("cannot render before the first reset(): there is no crystal yet")
-        if self._scene is None:
-            self._scene = Scene(*self.size)
-        picture = self._scene.draw(self.record)
+        if self._picture is None:
+            self._picture = Picture(*self.size)
+        picture = self._picture.draw(self.record)
         if self.mode == "rgb_array":
             return picture
         pygame = load()

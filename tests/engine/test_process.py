@@ -21,7 +21,7 @@ from cz_gym.config import make_config
 from cz_gym.differentiable import DifferentiableBatch
 from cz_gym.episodes.schedule import bias_offset, recipe, reference
 from cz_gym.evaluation.contender import Contender
-from cz_gym.evaluation.protocol import Row
+from cz_gym.evaluation.protocol import Case
 from cz_gym.evaluation.report.tables import DRIVES, ERROR, rows
 from cz_gym.evaluation.results import summarise
 from cz_gym.evaluation.rollout import rollout
@@ -227,7 +227,7 @@ def test_it_ends_with_success_once_enough_was_fed():
 
 def test_a_pid_in_rollout_and_table():
     """Against a policy that does nothing; metrics of what a tank has not are left out."""
-    row = Row("tank", "randomized", "a tank", process=TANK)
+    row = Case("tank", "randomized", "a tank", process=TANK)
     config = replace(row.config(), horizon=7200.0)
     run = rollout(Integrating(), config, range(8))
     still = rollout(type("Still", (Integrating,), {"predict": _still})(), config, range(8))

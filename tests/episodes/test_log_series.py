@@ -8,7 +8,7 @@ from cz_gym.config import make_config
 from cz_gym.episodes.log_series import to_csv
 from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
-from cz_gym.evaluation.user_code import row
+from cz_gym.evaluation.user_code import case
 from cz_gym.machine.puller import find_puller
 
 TIME = np.array([0.0, 10.0, 30.0])
@@ -51,7 +51,7 @@ def test_a_puller_of_one_s_own_keeps_them_and_other_contents_are_another_scenari
     one, other = (path.with_name(f"{k}.csv") for k, path in enumerate((place, place)))
     one.write_text(to_csv([FIRST]))
     other.write_text(to_csv([SECOND]))
-    scenario = row(str(one)).scenario
+    scenario = case(str(one)).scenario
     config = make_config(one, puller=find_puller("germanium"))
     assert config.sole_scenario.series == scenario.series == find_scenario(one).series
     assert len(scenario.series) == 7

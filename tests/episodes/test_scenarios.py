@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from cz_gym import SCENARIOS, Scenario
 from cz_gym.episodes.scenario import Drift, Faults, Interface, Pullers, Recipe
 from cz_gym.episodes.scenarios import find_scenario, mix_of
-from cz_gym.evaluation.protocol import find_row
+from cz_gym.evaluation.protocol import find_case
 
 FROZEN = {
     "nominal": "470ebb0cf8fc46d8", "paper-ramp": "00726411751b722d", "reference-a": "c61db8d3195dde7b",
@@ -96,4 +96,4 @@ def test_models_set_the_share_of_conduction_and_a_scenario_has_two_names():
     given = {None: (0.0, 1.0), "I": (1.0, 1.0), "II": (0.0, 0.0), 0.25: (0.25, 0.25)}
     assert {model: mix_of(model, SCENARIOS["randomized"]) for model in given} == given
     assert find_scenario("unknown-puller") == find_scenario("puller") == SCENARIOS["puller"]
-    assert find_row("unknown-puller") == find_row("puller")
+    assert find_case("unknown-puller") == find_case("puller")

@@ -18,7 +18,7 @@ from cz_gym.evaluation import cache, runner
 from cz_gym.evaluation.cache import code_behind, sources_behind
 from cz_gym.evaluation.contender import Contender
 from cz_gym.evaluation.metrics import metric_names
-from cz_gym.evaluation.protocol import Row
+from cz_gym.evaluation.protocol import Case
 from cz_gym.evaluation.results import Sample
 from cz_gym.evaluation.rollout import rollout
 from tests.observed import PLAIN
@@ -43,7 +43,7 @@ def slow(policy):
 
 
 @dataclass(frozen=True)
-class Fixed(Row):
+class Fixed(Case):
     """A row of given settings and seeds."""
 
     given: Any = CONFIG
@@ -163,7 +163,7 @@ def small(monkeypatch, tmp_path):
 
 def taking_part(arguments):
     given = benchmark.parse([*arguments, "--scenarios", "randomized,nominal"])
-    return [each.name for each in benchmark.contenders_of(given, benchmark.rows_of(given))]
+    return [each.name for each in benchmark.contenders_of(given, benchmark.cases_of(given))]
 
 
 def test_slow_controllers_run_only_when_asked_for(small, refused):

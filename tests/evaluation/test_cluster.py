@@ -17,7 +17,7 @@ pytest.importorskip("distributed")
 from cz_gym.baselines.registry import find_controller
 from cz_gym.errors import CzError
 from cz_gym.evaluation import cluster, user_code
-from cz_gym.evaluation.protocol import find_row
+from cz_gym.evaluation.protocol import find_case
 from cz_gym.evaluation.runner import run
 from tests.processes import ROOT
 
@@ -70,7 +70,7 @@ def workers(tmp_path):
 def test_two_workers_one_killed_bring_the_same_table(workers, tmp_path):
     (tmp_path / "mine.py").write_text(ONCE)
     contenders = [user_code.controller(f"{tmp_path / 'mine.py'}:once"), *map(find_controller, ("paper", "paper-tuned"))]
-    rows = [find_row("nominal"), find_row("randomized")]
+    rows = [find_case("nominal"), find_case("randomized")]
     with ThreadPoolExecutor() as pool:
         there = pool.submit(run, contenders, rows, 2, tmp_path, None, True, workers)
         while not (told := tmp_path / "process").exists():

@@ -17,7 +17,7 @@ from cz_gym.config import make_config
 from cz_gym.evaluation.cache import earlier_bound
 from cz_gym.evaluation.files import to_csv
 from cz_gym.evaluation.metrics import metric_names
-from cz_gym.evaluation.protocol import TEST_SEEDS, find_row
+from cz_gym.evaluation.protocol import TEST_SEEDS, find_case
 from cz_gym.evaluation.report.markdown import markdown
 from cz_gym.evaluation.results import Sample, summarise
 from cz_gym.evaluation.rollout import rollout
@@ -36,7 +36,7 @@ def made(name, errors, costs=None, **facts):
 
 
 def results_of(*samples):
-    return [summarise(find_row("randomized"), samples)]
+    return [summarise(find_case("randomized"), samples)]
 
 
 def test_the_gap_is_zero_at_the_bound_and_one_at_the_reference():
@@ -60,7 +60,7 @@ def test_different_numbers_of_episodes_meet_on_those_of_both():
         made("ppo", [0.4, 0.3, 9.0], training_seeds=(0,)),
         made("seer", [0.0] * 3, training_seeds=(0,), observation="state"),
     ]
-    result = summarise(find_row("randomized"), samples)
+    result = summarise(find_case("randomized"), samples)
     assert len(result.seeds) == 3
     assert result.paired["mpc"]["rmse_mm"][::2] == pytest.approx((0.55 - 1.5, 2))
     assert result.paired["lqg"]["rmse_mm"][::2] == pytest.approx((9.9 / 3 - 11.0, 3))
@@ -77,7 +77,7 @@ def test_different_numbers_of_episodes_meet_on_those_of_both():
 @pytest.fixture(scope="module")
 def paper():
     """The paper's controller on two crystals."""
-    run = rollout(CompensatedPID(), find_row("randomized").config(), TEST_SEEDS[:2])
+    run = rollout(CompensatedPID(), find_case("randomized").config(), TEST_SEEDS[:2])
     return Sample.of(contender("paper"), [run])
 
 
@@ -115,7 +115,7 @@ def test_gaps_are_measured_from_an_earlier_bound(earlier, tmp_path, monkeypatch)
 
 def test_a_bound_is_used_only_beside_the_same_figures_of_the_same_controller(earlier, paper):
     """A plant, a scenario or code that moves the paper's figures moves the bound's too."""
-    row = find_row("randomized")
+    row = find_case("randomized")
     found = earlier_bound(earlier, row, [paper])
     assert found is not None
     assert found.seeds == (2_000_000, 2_000_001)
@@ -123,14 +123,14 @@ def test_a_bound_is_used_only_beside_the_same_figures_of_the_same_controller(ear
     np.testing.assert_allclose(found.metric("cost"), [[0.3, 0.5]])
     assert earlier_bound(earlier, row, [replace(paper, values=paper.values * 1.001)]) is None
     assert earlier_bound(earlier, row, [replace(paper, contender=contender("other"))]) is None
-    assert earlier_bound(earlier, find_row("hard"), [paper]) is None
+    assert earlier_bound(earlier, find_case("hard"), [paper]) is None
     other = make_config("randomized", parameters=make_config(**PLAIN).parameters._replace(k_l=62.1), **PLAIN)
     moved = Sample.of(paper.contender, [rollout(find_controller("paper").make(other), other, paper.seeds)])
     assert earlier_bound(earlier, row, [moved]) is None
 
 
 def test_an_earlier_bound_needs_its_episodes_from_the_first_on(earlier, paper):
-    row, table = find_row("randomized"), earlier / "episodes.csv"
+    row, table = find_case("randomized"), earlier / "episodes.csv"
     whole = table.read_text()
     for broken in (whole.replace(",2000000,", ",2000001,"), whole.replace("cost", "price"), "", whole[:-9] + "nan\n"):
         table.write_text(broken)
@@ -140,7 +140,7 @@ def test_an_earlier_bound_needs_its_episodes_from_the_first_on(earlier, paper):
 
 
 def test_the_committed_bounds_can_be_used(paper):
-    found = earlier_bound(Path("results/bounds"), find_row("randomized"), [paper])
+    found = earlier_bound(Path("results/bounds"), find_case("randomized"), [paper])
     assert found is not None
     assert len(found.seeds) == 50
 

@@ -58,7 +58,7 @@ def test_changed_physics_is_never_run_from_an_old_cache(package, tmp_path):
     ("file", "before", "after", "same"),
     [
         ("physics/meniscus.py", '"""', '"""Edited: ', True),
-        ("rendering/scene.py", "import", "SIZE = 1.0\nimport", True),
+        ("rendering/picture.py", "import", "SIZE = 1.0\nimport", True),
         ("physics/meniscus.py", "B = 1.0", "B = 1.01", False),
         ("physics/young_laplace.json", "1", "2", False),
     ],

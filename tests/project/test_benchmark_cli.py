@@ -25,7 +25,7 @@ from cz_gym.evaluation import runner
 from cz_gym.evaluation.files import check_targets
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.processes import through
-from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, find_row
+from cz_gym.evaluation.protocol import CASES, TEST_SEEDS, find_case
 from cz_gym.observation import OBSERVATIONS
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
@@ -77,7 +77,7 @@ def refusal(refused):
 
 def contenders(*arguments):
     given = benchmark.parse(arguments)
-    return benchmark.contenders_of(given, benchmark.rows_of(given))
+    return benchmark.contenders_of(given, benchmark.cases_of(given))
 
 
 def test_default_contenders_are_those_of_the_registry_and_the_shipped_agents():
@@ -289,11 +289,11 @@ def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path):
 
 
 def test_rows_have_the_settings_that_their_names_say():
-    assert find_row("hard").seeds(7) == range(2_000_000, 2_000_007)
-    assert len(find_row("reference-b").seeds(500)) == 1
-    assert find_row("paper-ramp-II").config().mix == (0.0, 0.0)
-    assert find_row("randomized-2s").config("history").control_interval == 2.0
-    exact = find_row("randomized-exact")
+    assert find_case("hard").seeds(7) == range(2_000_000, 2_000_007)
+    assert len(find_case("reference-b").seeds(500)) == 1
+    assert find_case("paper-ramp-II").config().mix == (0.0, 0.0)
+    assert find_case("randomized-2s").config("history").control_interval == 2.0
+    exact = find_case("randomized-exact")
     assert (exact.config().meniscus, exact.design_config().meniscus) == (YOUNG_LAPLACE, HURLE)
 
 
@@ -338,7 +338,7 @@ def test_everything_of_a_benchmark_passes_to_other_processes_as_a_value(method, 
     Path("mine.py").write_text(MINE)
     own = [part for name in ("Still", "still", "made") for part in ("--controller", f"mine.py:{name}")]
     arguments = benchmark.parse([*own, "--scenario", "mine.py:later", "--controllers", "paper-tuned,lqg,ppo"])
-    (row,) = benchmark.rows_of(arguments)
+    (row,) = benchmark.cases_of(arguments)
     tasks = [runner.Task(each, row, 1, tmp_path) for each in benchmark.contenders_of(arguments, [row])]
     monkeypatch.chdir("/")
     with ProcessPoolExecutor(1, get_context(method)) as pool:
@@ -346,7 +346,7 @@ def test_everything_of_a_benchmark_passes_to_other_processes_as_a_value(method, 
     for number, task in enumerate(tasks):
         sample = runner.measure(task, lambda steps: None)
         np.testing.assert_array_equal(found[number], sample.values)
-    assert pickle.loads(pickle.dumps([*CONTROLLERS, *ROWS]))[-len(ROWS) :] == [*ROWS]
+    assert pickle.loads(pickle.dumps([*CONTROLLERS, *CASES]))[-len(CASES) :] == [*CASES]
 
 
 def values(task):
@@ -367,7 +367,7 @@ def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(tmp_path,
     told = re.search("`python (.*)` runs it", Path("out/report.md").read_text())
     assert told
     arguments = benchmark.parse(shlex.split(told[1])[1:])
-    assert [row.name for row in benchmark.rows_of(arguments)] == ["later"]
+    assert [row.name for row in benchmark.cases_of(arguments)] == ["later"]
     check_targets(arguments.out, arguments.json, True, arguments.overwrite)
     page, puller = Path("out/report.html").read_text(), make_config(**PLAIN).plant_hash
     assert "5 controllers, 1 scenario, up to 1 crystal each" in page

@@ -8,10 +8,10 @@ from cz_gym import HURLE, CzEnv, Parameters, make_puller
 from cz_gym.crystal_env import CzCrystalEnv
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.rendering import palette, scene, triple_point
+from cz_gym.rendering import palette, triple_point
 from cz_gym.rendering.canvas import Canvas
+from cz_gym.rendering.picture import MARGINS, error_range, layout
 from cz_gym.rendering.record import Ending
-from cz_gym.rendering.scene import layout
 from cz_gym.support.units import MM
 
 pygame = pytest.importorskip("pygame")
@@ -99,9 +99,9 @@ def test_the_rings_mark_is_at_the_rings_radius(pull, r_0):
 
 def test_the_chart_ends_at_the_true_error(picture):
     frame, record = picture
-    plot = PANELS.chart.inner(*scene.MARGINS)
+    plot = PANELS.chart.inner(*MARGINS)
     x = round(plot.x + record.t[-1] / record.config.horizon * plot.w)
-    y = plot.y + plot.h / 2 - record.error[-1] / scene.error_range(record.error) * plot.h / 2
+    y = plot.y + plot.h / 2 - record.error[-1] / error_range(record.error) * plot.h / 2
     check_near(near(frame, palette.TRUE)[:, x : x + 3].any(axis=1), y, 8)
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from cz_gym.agents.training import validation
 from cz_gym.agents.training.run import Job
-from cz_gym.evaluation.protocol import ROWS, TEST_SEEDS, VALIDATION_SEEDS
+from cz_gym.evaluation.protocol import CASES, TEST_SEEDS, VALIDATION_SEEDS
 from studies import algorithms, leaderboard
 from tests.small_learners import REFERENCES, SMALL, SMALL_APG, train_small_seed
 
@@ -17,7 +17,7 @@ def test_evaluation_crystals_neither_select_nor_test():
 
 @pytest.mark.usefixtures("few_crystals")
 def test_finished_runs_are_compared(tmp_path, monkeypatch, refused):
-    monkeypatch.setattr(leaderboard, "ROWS", ROWS[:2])
+    monkeypatch.setattr(leaderboard, "CASES", CASES[:2])
     assert "no finished run" in refused(algorithms.main, [str(tmp_path)])
     for recipe in (SMALL, SMALL_APG):
         train_small_seed(Job(tmp_path / recipe.name / "seed0", recipe, 0, REFERENCES))

@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 
 from cz_gym import agents
-from cz_gym.evaluation.protocol import ROWS, TRAINING_SEEDS, contract_hash
+from cz_gym.evaluation.protocol import CASES, TRAINING_SEEDS, contract_hash
 from studies import leaderboard
 
 MEAN = {"mean": 0.0125, "ci95": None}
@@ -17,13 +17,13 @@ MEAN = {"mean": 0.0125, "ci95": None}
 @pytest.fixture
 def submissions(tmp_path, monkeypatch):
     """A folder with one submission, the shipped PPO under another name, with a claim that is too good."""
-    monkeypatch.setattr(leaderboard, "ROWS", ROWS[:1])
+    monkeypatch.setattr(leaderboard, "CASES", CASES[:1])
     monkeypatch.setattr(leaderboard, "CONTROLLERS", leaderboard.CONTROLLERS[:2])
     folder = tmp_path / "submissions" / "mine"
     folder.mkdir(parents=True)
     for file in agents.MODELS.glob("ppo-seed0.*"):
         shutil.copy(file, folder)
-    results, contract = {"randomized": {"mine": {"rmse_mm": MEAN}}}, contract_hash(ROWS[:1])
+    results, contract = {"randomized": {"mine": {"rmse_mm": MEAN}}}, contract_hash(CASES[:1])
     claim = {"results": results, "provenance": {"contract": contract}}
     (folder / "benchmark.json").write_text(json.dumps(claim))
     return folder.parent
@@ -54,7 +54,7 @@ def test_an_agent_has_the_smallest_budget_that_its_longest_training_keeps(steps,
 
 
 def test_fresh_seeds_are_nobody_else_s():
-    taken = {seed for row in ROWS for seed in row.seeds(500)} | {TRAINING_SEEDS.stop}
+    taken = {seed for row in CASES for seed in row.seeds(500)} | {TRAINING_SEEDS.stop}
     assert max(taken) < leaderboard.FRESH.start
 
 

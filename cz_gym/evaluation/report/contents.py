@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.evaluation.protocol import Row
+from cz_gym.evaluation.protocol import Case
 from cz_gym.evaluation.results import Result
 
 from . import crystal, crystals, tables
@@ -20,13 +20,13 @@ class Contents(NamedTuple):
     overview: Callable[[Sequence[Result]], tuple[tuple[str, ...], dict[str, list[tuple[str, ...]]]]]
     verdict: Callable[..., Verdict]
     columns: tuple[tuple[Column, ...], ...]
-    """Columns of a row's tables of metrics."""
+    """Columns of a case's tables of metrics."""
     short: tuple[Column, ...]
     """Columns on a terminal."""
     losses: Callable[[Result], Table] | None
     """How crystals were lost, if there are several ways and parts."""
     picture: Callable[[Result], bytes]
-    """The first crystal of a row, as PNG."""
+    """The first crystal of a case, as PNG."""
 
 
 _BODY = Contents(tables.overview, tables.verdict, (tables.ERROR, tables.DRIVES), tables.SHORT, None, crystal.crystal)
@@ -40,6 +40,6 @@ _CRYSTAL = Contents(
 )
 
 
-def contents_of(row: Row) -> Contents:
-    """The parts of the report of a row's process."""
-    return _CRYSTAL if row.process == CRYSTAL else _BODY
+def contents_of(case: Case) -> Contents:
+    """The parts of the report of a case's process."""
+    return _CRYSTAL if case.process == CRYSTAL else _BODY

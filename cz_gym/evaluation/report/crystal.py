@@ -46,7 +46,7 @@ _PANELS = (
 )
 
 
-class Column(NamedTuple):
+class DrawnCrystal(NamedTuple):
     """A crystal under one controller."""
 
     title: str
@@ -55,20 +55,20 @@ class Column(NamedTuple):
     lost: bool
 
 
-def draw(columns: Sequence[Column], dt: float, title: str, tolerance: float = 0.0) -> Figure:
+def draw(crystals: Sequence[DrawnCrystal], dt: float, title: str, tolerance: float = 0.0) -> Figure:
     """Draw a crystal under some controllers, at steps of ``dt`` [s], with a band of the tolerance [m] in grey."""
-    figure = canvas(max(1.62 * len(columns) + 1.0, 5.0), 7.6)
-    axes = figure.subplots(len(_PANELS), len(columns), sharex=True, sharey="row", squeeze=False)
-    longest = max((column.signals for column in columns), key=lambda signals: len(signals.r_c))
-    for place, column in enumerate(columns):
+    figure = canvas(max(1.62 * len(crystals) + 1.0, 5.0), 7.6)
+    axes = figure.subplots(len(_PANELS), len(crystals), sharex=True, sharey="row", squeeze=False)
+    longest = max((crystal.signals for crystal in crystals), key=lambda signals: len(signals.r_c))
+    for place, crystal in enumerate(crystals):
         if tolerance:
             ends = (longest.r_ref - tolerance) / MM, (longest.r_ref + tolerance) / MM
             axes[0, place].fill_between(_minutes(len(longest.r_ref), dt), *ends, color=GREY, alpha=0.3, lw=0)
-        _draw(axes[:, place], column, dt, longest.r_ref)
+        _draw(axes[:, place], crystal, dt, longest.r_ref)
     for row, panel in enumerate(_PANELS):
         axes[row, 0].set_ylabel(panel.label.replace(" [", "\n["))
     figure.align_ylabels(axes[:, 0])
-    _set_limits(axes, columns, longest, dt)
+    _set_limits(axes, crystals, longest, dt)
     figure.suptitle(title, fontsize=10.5)
     handles: list[Any] = [
         Line2D([], [], color=INK, lw=1.2, ls="--", label="reference"),
@@ -84,18 +84,18 @@ def draw(columns: Sequence[Column], dt: float, title: str, tolerance: float = 0.
 def crystal(result: Result) -> bytes:
     """Draw the first crystal of a scenario under the controllers of :func:`.chosen`."""
     samples, style = chosen(result.samples, COLUMNS), styles_of(result.samples)
-    columns = []
+    crystals = []
     for sample in samples:
         rmse = f"RMSE {sample.metric('rmse_mm')[0, 0]:.3g} mm"
-        columns.append(
-            Column(f"{fill(sample.name, 18)}\n{rmse}", example(sample), style[sample.name].colour, lost(sample))
+        crystals.append(
+            DrawnCrystal(f"{fill(sample.name, 18)}\n{rmse}", example(sample), style[sample.name].colour, lost(sample))
         )
-    title = f"One crystal of {result.row.name} (test seed {samples[0].seeds[0]:,})"
-    return png(draw(columns, result.row.control_interval, title, result.row.tolerance or 0.0))
+    title = f"One crystal of {result.case.name} (test seed {samples[0].seeds[0]:,})"
+    return png(draw(crystals, result.case.control_interval, title, result.case.tolerance or 0.0))
 
 
-def _draw(axes: Any, column: Column, dt: float, reference: Floats) -> None:
-    signals, colour = column.signals, column.colour
+def _draw(axes: Any, crystal: DrawnCrystal, dt: float, reference: Floats) -> None:
+    signals, colour = crystal.signals, crystal.colour
     minutes = _minutes(len(signals.r_c), dt)
     axes[0].plot(_minutes(len(reference), dt), reference / MM, color=INK, lw=1.0, ls="--", zorder=3)
     axes[1].plot(minutes, signals.r_br_measured / MM, color=GREY, lw=0.4)
@@ -106,9 +106,9 @@ def _draw(axes: Any, column: Column, dt: float, reference: Floats) -> None:
             window = min(max(round(SMOOTH / dt), 1), len(values))
             mean = np.convolve(values, np.full(window, 1.0 / window), "valid")
             axis.plot(minutes[window - 1 :] - 0.5 * (window - 1) * dt / MINUTE, mean, color=colour, lw=1.4)
-        if column.lost:
+        if crystal.lost:
             axis.axvline(minutes[-1], color=INK, lw=0.8, ls=":")
-    axes[0].set_title(column.title + ", lost" * column.lost, fontsize=9, color=INK, fontweight="bold")
+    axes[0].set_title(crystal.title + ", lost" * crystal.lost, fontsize=9, color=INK, fontweight="bold")
     axes[-1].set_xlabel("time [min]")
 
 
@@ -117,9 +117,9 @@ def lost(sample: Sample) -> bool:
     return bool(sample.metric("failure_rate")[0, 0])
 
 
-def _set_limits(axes: Any, columns: Sequence[Column], longest: Logged, dt: float) -> None:
+def _set_limits(axes: Any, crystals: Sequence[DrawnCrystal], longest: Logged, dt: float) -> None:
     """Set the axes' limits by the crystals that were not lost; a lost one leaves the picture."""
-    whole = [column.signals for column in columns if not column.lost] or [column.signals for column in columns]
+    whole = [crystal.signals for crystal in crystals if not crystal.lost] or [crystal.signals for crystal in crystals]
     worst = max(float(np.abs(signals.r_c - signals.r_ref).max()) for signals in whole)
     width = 1.15 * float(np.clip(worst, *ROOM))
     ends = np.array([longest.r_ref.min() - width, longest.r_ref.max() + width])

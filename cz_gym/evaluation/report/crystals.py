@@ -39,22 +39,22 @@ SHORT = tuple(
     for column in (FAILURES, CROWN, CROWN_95, BODY, V_OVER_G, TAIL_95, HOURS, ENERGY, PULL_STEP)
 )
 _OVERVIEW = ((CROWN_95, 0), (BODY, 1), (V_OVER_G, 1), (TAIL_95, 2), (ENERGY, 1))
-"""Columns of the overview, with the part of the crystal whose row they are taken from."""
+"""Columns of the overview, with the part of the crystal whose case they are taken from."""
 
 
 def grows(results: Sequence[Result], part: int) -> Result:
     """The first result whose stage is a part of the crystal, or the whole; else the first one."""
-    return next((each for each in results if each.row.stage in (PARTS[part], "whole")), results[0])
+    return next((each for each in results if each.case.stage in (PARTS[part], "whole")), results[0])
 
 
 def overview(results: Sequence[Result]) -> tuple[tuple[str, ...], dict[str, list[tuple[str, ...]]]]:
-    """Return heads, and rows by what contenders knew: losses on each row, then what counts in crown, body and tail."""
+    """Return heads, and rows by what contenders knew: losses on each case, then what counts in crown, body and tail."""
     groups: dict[str, list[tuple[str, ...]]] = {}
     for sample in results[0].samples:
         failures = " / ".join(_plain(FAILURES, result, sample.name) for result in results)
         cells = (_plain(column, grows(results, part), sample.name) for column, part in _OVERVIEW)
         groups.setdefault(sample.contender.knows, []).append((label(sample, results[0]), failures, *cells))
-    lost_on = f"lost of {' / '.join(result.row.name for result in results)} [%]"
+    lost_on = f"lost of {' / '.join(result.case.name for result in results)} [%]"
     return ("controller", lost_on, *(column.heading for column, _ in _OVERVIEW)), groups
 
 
@@ -74,7 +74,7 @@ def verdict(results: Sequence[Result], column: Column = RMSE) -> Verdict:
         return lost_crystals, crown.means[name][RMSE.metric].mean
 
     best = min(able, key=place)
-    lost_of = (f"{_plain(FAILURES, result, best)} % of {result.row.name}" for result in results)
+    lost_of = (f"{_plain(FAILURES, result, best)} % of {result.case.name}" for result in results)
     crowns, bodies = _plain(CROWN_95, crown, best), _plain(BODY, body, best)
     said = [f"{best} loses the fewest crystals, {', '.join(lost_of)}"]
     said += [f"95 % of its crowns are at most {crowns} mm off"] if crowns != NOTHING else []
@@ -150,7 +150,7 @@ def draw(result: Result) -> bytes:
         axis.set_ylabel(panel.label.replace(" [", "\n["))
     axis.set_xlabel("length [mm]")
     figure.suptitle(
-        f"One crystal, {result.row.name} (test seed {samples[0].seeds[0]:,}); dashed: the recipe", fontsize=10.5
+        f"One crystal, {result.case.name} (test seed {samples[0].seeds[0]:,}); dashed: the recipe", fontsize=10.5
     )
     return png(figure)
 

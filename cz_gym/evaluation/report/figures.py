@@ -23,7 +23,7 @@ def draw_figures(results: Sequence[Result]) -> dict[str, bytes]:
     """Draw every figure, by file name; without a random scenario there is only the crystal."""
     random = [result for result in results if len(result.seeds) > 1]
     with rc_context({"text.parse_math": False}):  # a name with dollar signs is no formula
-        figures = {"crystal.png": contents_of(results[0].row).picture(results[0])}
+        figures = {"crystal.png": contents_of(results[0].case).picture(results[0])}
         if random:
             figures["pareto.png"] = pareto(random)
     return figures
@@ -46,7 +46,7 @@ def pareto(results: Sequence[Result]) -> bytes:
     for axis, result in zip(axes, results, strict=False):
         axis.set(xscale="log", yscale="log", xlabel=PULL_STEP.heading, ylabel=RMSE.heading)
         axis.tick_params(labelbottom=True, labelleft=True)
-        axis.set_title(result.row.name, fontsize=9.5)
+        axis.set_title(result.case.name, fontsize=9.5)
         moving = (each for each in result.means.values() if each[PULL_STEP.metric].mean > 0.0)
         most = FAR * min((each[RMSE.metric].mean for each in moving), default=np.inf)
         for name, means in result.means.items():

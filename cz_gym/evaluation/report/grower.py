@@ -8,7 +8,7 @@ import numpy as np
 
 from cz_gym.body.plant import make_puller
 from cz_gym.errors import CzError
-from cz_gym.evaluation.protocol import Row
+from cz_gym.evaluation.protocol import Case
 from cz_gym.evaluation.results import Result, Sample
 from cz_gym.evaluation.statistics import Estimate, Resamples, means
 from cz_gym.support.units import MM, PERCENT
@@ -47,14 +47,14 @@ MARGINS = ("controller", "gain may grow by", "gain may fall to", "phase margin [
 """Heads of :func:`margins`."""
 
 
-def title(row: Row) -> str:
+def title(case: Case) -> str:
     """A heading that names the puller and its diameter."""
-    return f"Puller {row.puller.name}, {2.0 * row.puller.parameters.r_0 / MM:g} mm in diameter"
+    return f"Puller {case.puller.name}, {2.0 * case.puller.parameters.r_0 / MM:g} mm in diameter"
 
 
 def band(result: Result) -> str:
     """The tolerance band of the diameter in words."""
-    return f"±{2.0 * (result.row.tolerance or 0.0) / MM:g} mm"
+    return f"±{2.0 * (result.case.tolerance or 0.0) / MM:g} mm"
 
 
 def scrap(sample: Sample) -> Estimate | None:
@@ -92,7 +92,7 @@ def recommendation(results: Sequence[Result]) -> str:
     best = min(able, key=lambda sample: _order(counted, sample))
     lost, share = _order(counted, best)
     steady = np.mean([result.means[best.name][VG.metric].mean for result in counted])
-    machine, who = counted[0].row.puller.name, best.name
+    machine, who = counted[0].case.puller.name, best.name
     fate = (
         f"Recommended for {machine}: {who}, which loses {f'{lost / PERCENT:.2g} %' if lost else 'none'}"
         if lost <= FIT
@@ -105,7 +105,7 @@ def recommendation(results: Sequence[Result]) -> str:
         else ""
     )
     return (
-        f"{fate} of {crystals(number)} on {' and '.join(result.row.name for result in counted)}. The diameter is "
+        f"{fate} of {crystals(number)} on {' and '.join(result.case.name for result in counted)}. The diameter is "
         f"outside {band(counted[0])} for {share / PERCENT:.2g} % of the time (scrap), and v/G is within 3 % for "
         f"{steady / PERCENT:.3g} %.{loop}"
     )
@@ -117,7 +117,7 @@ def margins(samples: Sequence[Sample], result: Result) -> list[tuple[str, ...]]:
 
 
 def _margins(sample: Sample, result: Result) -> tuple[str, ...]:
-    config = result.row.config(sample.contender.observation, sample.contender.action)
+    config = result.case.config(sample.contender.observation, sample.contender.action)
     absent = (NOTHING,) * (len(MARGINS) - 1)
     if sample.contender.learned:
         return absent

@@ -36,9 +36,9 @@ MARKERS = "<!-- {}:begin -->", "<!-- {}:end -->"
 
 def summary(results: Sequence[Result]) -> str:
     """Return :func:`overview` in Markdown, and its contract below."""
-    heads, groups = contents_of(results[0].row).overview(results)
+    heads, groups = contents_of(results[0].case).overview(results)
     lines = [line for group, listed in groups.items() for line in ((f"*{group}*", *[""] * (len(heads) - 1)), *listed)]
-    contract = contract_hash([result.row for result in results])
+    contract = contract_hash([result.case for result in results])
     rests_on = "plant, random scenarios, interval, horizon, reward, metrics"
     return f"{table(heads, lines)}\n\nContract `{contract}` ({rests_on})."
 
@@ -46,14 +46,15 @@ def summary(results: Sequence[Result]) -> str:
 def brief(results: Sequence[Result]) -> str:
     """Return :func:`summary` of the random scenarios, of the controllers that a figure would show first."""
     first, *others = deciding(results)
-    if first.row.process == CRYSTAL:
+    if first.case.process == CRYSTAL:
         return summary(results)
     return summary([replace(first, samples=tuple(chosen(first.samples, ROWS))), *others])
 
 
 def fill_in(page: str, results: Sequence[Result]) -> str:
     """Return a page with :func:`brief` between its two markers; the page itself if it has none."""
-    first, last = (marker.format("crystal" if results[0].row.process == CRYSTAL else "benchmark") for marker in MARKERS)
+    name = "crystal" if results[0].case.process == CRYSTAL else "benchmark"
+    first, last = (marker.format(name) for marker in MARKERS)
     before, begin, rest = page.partition(first)
     _, end, after = rest.partition(last)
     return f"{before}{begin}\n{brief(results)}\n{end}{after}" if end else page
@@ -61,11 +62,11 @@ def fill_in(page: str, results: Sequence[Result]) -> str:
 
 def markdown(results: Sequence[Result], command: str, figures: Iterable[str]) -> str:
     """Return ``report.md``; it begins with :func:`verdict`."""
-    row = results[0].row
+    case = results[0].case
     parts = [
-        *(_verdict(results) if row.tolerance is None else _for_a_grower(results)),
+        *(_verdict(results) if case.tolerance is None else _for_a_grower(results)),
         "# Benchmark",
-        *(_of_crystals(results) if row.process == CRYSTAL else _of_bodies(results)),
+        *(_of_crystals(results) if case.process == CRYSTAL else _of_bodies(results)),
         summary(results),
         *(f"![{name.removesuffix('.png')}]({name})" for name in figures),
         "## Who took part",
@@ -90,11 +91,11 @@ def _none_of(results: Sequence[Result]) -> str:
 
 def _of_bodies(results: Sequence[Result]) -> list[str]:
     """What was measured, and how it counts."""
-    row = results[0].row
-    config = row.config()
+    case = results[0].case
+    config = case.config()
     return [
         f"Every controller meets the same crystals (test seeds), {config.horizon / HOUR:.3g} h each at "
-        f"{config.control_interval:g} s control, on {row.grown_on}.",
+        f"{config.control_interval:g} s control, on {case.grown_on}.",
         f"{INTERVALS} After a failure the radius error counts {config.radius_limit / MM:.3g} mm to "
         f"the end; drives, growth rate and ground-off are those of the time before it. {_none_of(results)} The verdict "
         "compares radius errors alone: who moves the pull speed more can have less. docs/controllers/bounds.md "
@@ -105,10 +106,10 @@ def _of_bodies(results: Sequence[Result]) -> list[str]:
 
 def _of_crystals(results: Sequence[Result]) -> list[str]:
     """The same of whole crystals."""
-    row = results[0].row
+    case = results[0].case
     return [
-        f"Every controller meets the same whole crystals, or parts of them (test seeds), at {row.control_interval:g} s "
-        f"control, on {row.grown_on}.",
+        f"Every controller meets the same whole crystals, or parts of them (test seeds), at {case.control_interval:g} "
+        f"s control, on {case.grown_on}.",
         f"{INTERVALS} Errors are those of the true radius against the recipe's at the length grown; a crystal that is "
         f"lost in crown or tail has the largest allowed one there. What is said of the body is said of the length that "
         f"was grown. {_none_of(results)} docs/crystal.md explains every column.",
@@ -117,24 +118,24 @@ def _of_crystals(results: Sequence[Result]) -> list[str]:
 
 
 def _verdict(results: Sequence[Result]) -> list[str]:
-    verdict = contents_of(results[0].row).verdict(results)
+    verdict = contents_of(results[0].case).verdict(results)
     return [verdict.sentence, *([table(verdict.heads, verdict.rows)] if verdict.rows else [])]
 
 
 def _for_a_grower(results: Sequence[Result]) -> list[str]:
     """The recommendation, what each controller gives on each scenario, and how much its loop bears."""
-    parts = [grower.recommendation(results), f"# {grower.title(results[0].row)}"]
+    parts = [grower.recommendation(results), f"# {grower.title(results[0].case)}"]
     for result in results:
-        parts += [f"**{result.row.name}**: {result.row.meaning}.", table(*grower.outcome(result))]
+        parts += [f"**{result.case.name}**: {result.case.meaning}.", table(*grower.outcome(result))]
     margins = table(grower.MARGINS, grower.margins(results[0].samples, results[0]))
     agents = any(sample.contender.learned for sample in results[0].samples)
     return [*parts, grower.EXPLAINED, margins, grower.MARGINS_EXPLAINED, *(_verdict(results) if agents else [])]
 
 
 def _scenario(result: Result) -> list[str]:
-    meaning, shown = result.row.meaning, contents_of(result.row)
+    meaning, shown = result.case.meaning, contents_of(result.case)
     parts = [
-        f"## {result.row.name} ({crystals(len(result.seeds))})",
+        f"## {result.case.name} ({crystals(len(result.seeds))})",
         f"{meaning[0].upper()}{meaning[1:]}.",
         *(_metrics(result, columns) for columns in shown.columns),
         *([table(*shown.losses(result))] if shown.losses else []),
@@ -153,17 +154,17 @@ def _metrics(result: Result, columns: Sequence[Column]) -> str:
 
 def measured_from(result: Result) -> str:
     """Return a sentence on where the optimality gap comes from, or how to get it; none on a grower's puller."""
-    row, bound = result.row, result.earlier_bound
-    if row.tolerance is not None:
+    case, bound = result.case, result.earlier_bound
+    if case.tolerance is not None:
         return ""
     if bound is not None:
         count = crystals(len(common(bound, *result.samples)[0].seeds))
         return f"Optimality gaps are measured from `{BOUND}` of an earlier run (results/bounds), on the first {count}."
     if any(result.gaps.values()):
         return f"Optimality gaps are measured from `{BOUND}` on the crystals that it met."
-    place = f"--scenario {shlex.quote(row.file)}" if row.file else f"--scenarios {row.name}"
+    place = f"--scenario {shlex.quote(case.file)}" if case.file else f"--scenarios {case.name}"
     return (
-        f"No optimality gap: results/bounds does not have the bound for {row.name}, or it is no better than "
+        f"No optimality gap: results/bounds does not have the bound for {case.name}, or it is no better than "
         f"{REFERENCE}. `python benchmark.py --slow --controllers {REFERENCE},{BOUND} {place} --out runs/bound` runs it."
     )
 
@@ -185,21 +186,21 @@ def _training_seeds(pooled: Sequence[Sample]) -> str:
 
 def terminal(results: Sequence[Result]) -> str:
     """Return a short table a scenario, RMSE with its interval, then means, and the verdict or the recommendation."""
-    verdict = contents_of(results[0].row).verdict(results, RMSE._replace(interval=False))
-    parts = [*map(_short, results), *([verdict.sentence] if verdict.rows or results[0].row.tolerance is None else [])]
+    verdict = contents_of(results[0].case).verdict(results, RMSE._replace(interval=False))
+    parts = [*map(_short, results), *([verdict.sentence] if verdict.rows or results[0].case.tolerance is None else [])]
     parts += [_aligned(verdict.heads, verdict.rows)] if verdict.rows else []
-    return "\n\n".join(parts + ([grower.recommendation(results)] if results[0].row.tolerance else []))
+    return "\n\n".join(parts + ([grower.recommendation(results)] if results[0].case.tolerance else []))
 
 
 def _short(result: Result) -> str:
-    row, columns = result.row, contents_of(result.row).short
-    grown_on = f", on {row.grown_on}" if row.file or row.puller != DEFAULT else ""
+    case, columns = result.case, contents_of(result.case).short
+    grown_on = f", on {case.grown_on}" if case.file or case.puller != DEFAULT else ""
     columns = tuple(each for each in columns if any(cell != NOTHING for _, cell in rows(result, [each])))
     heads: Sequence[str] = ["controller", *(column.heading for column in columns)]
     lines = rows(result, columns)
-    if row.tolerance is not None:
+    if case.tolerance is not None:
         heads, lines = grower.outcome(result, interval=False)
-    return f"{row.name} ({crystals(len(result.seeds))}){grown_on}\n{_aligned(heads, lines)}"
+    return f"{case.name} ({crystals(len(result.seeds))}){grown_on}\n{_aligned(heads, lines)}"
 
 
 def _aligned(heads: Sequence[str], lines: Iterable[tuple[str, ...]]) -> str:

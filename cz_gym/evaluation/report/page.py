@@ -34,9 +34,9 @@ _SLOT = re.compile(r"<!-- slot:(\w+) -->")
 
 def page(results: Sequence[Result], command: str) -> str:
     """Return the page; the same results give the same text."""
-    row, samples, shown = results[0].row, results[0].samples, contents_of(results[0].row)
+    case, samples, shown = results[0].case, results[0].samples, contents_of(results[0].case)
     verdict = shown.verdict(results)
-    config, most = row.config(), max(len(result.seeds) for result in results)
+    config, most = case.config(), max(len(result.seeds) for result in results)
     counted = tables.deciding(results)
     best = replace(counted[0], samples=tuple(tables.best_of_each_kind(counted)))
     heads, groups = shown.overview([best, *counted[1:]])
@@ -51,7 +51,7 @@ def page(results: Sequence[Result], command: str) -> str:
         "limit": f"{config.radius_limit / MM:.3g}",
         "lede": f"{tables.count(len(samples), 'controller')}, {tables.count(len(results), 'scenario')}, "
         f"up to {tables.crystals(most)} each, the same for everyone: at most {config.horizon / HOUR:.3g} h at one "
-        f"action every {config.control_interval:g} s, on {row.grown_on}.",
+        f"action every {config.control_interval:g} s, on {case.grown_on}.",
         "scenarios": _table(verdict.heads, verdict.rows) if verdict.rows else "",
         "tables": "\n".join(_metrics(result, is_open=result is results[0]) for result in results),
         "pareto": _html(pareto(results), "pareto"),
@@ -59,17 +59,17 @@ def page(results: Sequence[Result], command: str) -> str:
         "controllers": _table(tables.WHO, tables.who(samples), "words"),
         "command": escape(command),
     }
-    if row.tolerance is not None:
+    if case.tolerance is not None:
         parts |= _for_a_grower(results)
     return _SLOT.sub(lambda slot: parts[slot[1]], _asset("page.html"))
 
 
 def _for_a_grower(results: Sequence[Result]) -> dict[str, str]:
     """The parts of the page that differ on a puller."""
-    tables_of = (f"<h3>{escape(result.row.name)}</h3>{_table(*grower.outcome(result))}" for result in results)
+    tables_of = (f"<h3>{escape(result.case.name)}</h3>{_table(*grower.outcome(result))}" for result in results)
     return {
         "verdict": escape(grower.recommendation(results)),
-        "best": f"<h2>{escape(grower.title(results[0].row))}</h2>{''.join(tables_of)}",
+        "best": f"<h2>{escape(grower.title(results[0].case))}</h2>{''.join(tables_of)}",
         "best_note": escape(grower.EXPLAINED),
         "question": "What the loops bear",
         "scenarios": _table(grower.MARGINS, grower.margins(results[0].samples, results[0])),
@@ -88,16 +88,16 @@ def _html(figure: Figure, name: str) -> str:
 
 def _metrics(result: Result, is_open: bool) -> str:
     """Every metric of a scenario, the lowest RMSE first, to unfold."""
-    error, drives = contents_of(result.row).columns
+    error, drives = contents_of(result.case).columns
     columns = (*error, *tables.comparison(result), *drives)
     ranked = sorted(result.samples, key=lambda sample: result.means[sample.name][tables.RMSE.metric].mean)
     heads = "controller", *(column.heading for column in columns)
     rows = tables.rows(replace(result, samples=tuple(ranked)), columns)
     marks = (" [bound]" * sample.contender.bound for sample in ranked)
     marked = [(f"{name}{mark}", *cells) for mark, (name, *cells) in zip(marks, rows, strict=True)]
-    about = escape(f"{result.row.meaning}. {measured_from(result).replace('`', '')}")
+    about = escape(f"{result.case.meaning}. {measured_from(result).replace('`', '')}")
     return (
-        f"<details{' open' if is_open else ''}><summary>{escape(result.row.name)} "
+        f"<details{' open' if is_open else ''}><summary>{escape(result.case.name)} "
         f'({tables.crystals(len(result.seeds))})</summary><p class="note">{about}</p>{_table(heads, marked)}</details>'
     )
 

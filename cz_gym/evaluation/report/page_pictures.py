@@ -12,7 +12,7 @@ from plotly.subplots import make_subplots
 from cz_gym.body.cost import TOLERANCE
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.env import CzEnv
-from cz_gym.evaluation.protocol import Row
+from cz_gym.evaluation.protocol import Case
 from cz_gym.evaluation.results import Result
 from cz_gym.evaluation.rollout import Floats
 from cz_gym.evaluation.statistics import Estimate
@@ -41,7 +41,7 @@ def add_menu(figure: go.Figure, results: Sequence[Result], layouts: Sequence[Map
     for number, result in enumerate(results):
         arguments: list[Any] = [{"visible": [trace.meta == number for trace in figure.data]}]
         arguments += [dict(layouts[number])] if layouts else []
-        buttons.append({"label": plain(result.row.name), "method": "update", "args": arguments})
+        buttons.append({"label": plain(result.case.name), "method": "update", "args": arguments})
     figure.for_each_trace(lambda trace: trace.update(visible=trace.meta == 0))
     menu = {"buttons": buttons, "x": 0, "xanchor": "left", "y": 1, "yanchor": "bottom", "pad": {"b": 28}}
     figure.update_layout(updatemenus=[menu] if len(results) > 1 else [], **(layouts[0] if layouts else {}))
@@ -144,7 +144,7 @@ OWN = ("true", "camera")
 
 def crystal(results: Sequence[Result]) -> go.Figure:
     """Draw the first crystal of each scenario, one scenario at a time, under the controllers of :func:`chosen`."""
-    whole = results[0].row.process == CRYSTAL
+    whole = results[0].case.process == CRYSTAL
     panels = CRYSTAL_PANELS if whole else PANELS
     titles = [f"{panel.title} [{panel.unit}]" for panel in panels]
     figure = make_subplots(len(panels), 1, shared_xaxes=True, vertical_spacing=0.02, subplot_titles=titles)
@@ -155,7 +155,7 @@ def crystal(results: Sequence[Result]) -> go.Figure:
             line = {"color": GREY, "width": 1, "dash": "dot"}
             figure.add_hline(level, row=row, col=1, line=line, layer="below")
     if not whole:
-        figure.update_xaxes(range=[0.0, results[0].row.config().horizon / MINUTE])
+        figure.update_xaxes(range=[0.0, results[0].case.config().horizon / MINUTE])
     figure.update_xaxes(hoverformat=".2f", nticks=10)
     figure.update_xaxes(title="length [mm]" if whole else "time [min]", row=len(panels), col=1)
     legend = {"orientation": "h", "y": -0.04, "yanchor": "top", "groupclick": "togglegroup"}
@@ -168,9 +168,9 @@ def _draw(
     figure: go.Figure, scenario: int, result: Result, styles: Mapping[str, Style], panels: Sequence[Panel]
 ) -> dict[str, Any]:
     """Add the lines of a scenario and return the ranges of its panels: those of the crystals that were not lost."""
-    samples, interval = chosen(result.samples, COLUMNS), result.row.control_interval
-    by_length = result.row.process == CRYSTAL
-    bias = 0.0 if by_length else ring_bias(result.row, result.seeds[0])
+    samples, interval = chosen(result.samples, COLUMNS), result.case.control_interval
+    by_length = result.case.process == CRYSTAL
+    bias = 0.0 if by_length else ring_bias(result.case, result.seeds[0])
     step = max(round(POINT / interval), 1)
     time = {"x0": 0.5 * step * interval / MINUTE, "dx": step * interval / MINUTE}
     longest = max(map(example, samples), key=lambda signals: len(signals.r_c))
@@ -210,8 +210,8 @@ def _points(values: Floats, step: int) -> npt.NDArray[np.float32]:
     return points
 
 
-def ring_bias(row: Row, seed: int) -> float:
+def ring_bias(case: Case, seed: int) -> float:
     """Return the operator's bias of a seed's puller [m]: bright ring less radius at its own steady state."""
-    env = CzEnv.from_config(row.config())
+    env = CzEnv.from_config(case.config())
     env.reset(seed=seed)
     return float(env.get_state().slot.slot["puller"]["ring_bias"])

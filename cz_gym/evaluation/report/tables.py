@@ -95,7 +95,7 @@ def comparison(result: Result) -> tuple[Column, ...]:
 
 
 def label(sample: Sample, result: Result) -> str:
-    """Return the contender's name, and how many crystals it met if fewer than the row has."""
+    """Return the contender's name, and how many crystals it met if fewer than the case has."""
     met = len(sample.seeds)
     return sample.name + (f" (n = {met})" if met < len(result.seeds) else "")
 
@@ -149,7 +149,7 @@ def overview(results: Sequence[Result]) -> tuple[tuple[str, ...], dict[str, list
         errors, failures, *others = zip(*(each[name] for each in texts), strict=True)
         line = name, *errors, *(first for first, *_ in others), " / ".join(failures)
         groups.setdefault(sample.contender.knows, []).append(line)
-    heads = "controller", *(result.row.name for result in results), *(column.heading for column in alone)
+    heads = "controller", *(result.case.name for result in results), *(column.heading for column in alone)
     return (*heads, FAILURES.heading), groups
 
 
@@ -208,8 +208,8 @@ def verdict(results: Sequence[Result], column: Column = RMSE) -> Verdict:
             name = min(names, key=lambda name: errors[name].mean)
             row += [f"{name} {column.text(errors[name])}", RMSE.text(result.verdicts[name])]
         clear = won or all(map(result.loses, result.verdicts))
-        where["a learned agent" if won else "a classical controller" if clear else ""].append(result.row.name)
-        rows.append((result.row.name, *row, best if clear else "no difference shown"))
+        where["a learned agent" if won else "a classical controller" if clear else ""].append(result.case.name)
+        rows.append((result.case.name, *row, best if clear else "no difference shown"))
     return Verdict(_sentence(where), (*heads, "lowest error"), tuple(rows))
 
 

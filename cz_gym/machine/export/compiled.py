@@ -17,7 +17,7 @@ from .program import Program
 from .shell import Block
 from .text import write_c
 from .trace import Floats
-from .writer import Writer
+from .writer import StatementWriter
 
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
 """Options of the compiler."""
@@ -26,7 +26,7 @@ FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2", "-ffp-co
 def memory_of(program: Program, single: bool = False) -> tuple[np.dtype[Any], int]:
     """The structure of a block in C, and the most stack [byte] that a call needs."""
     real = "f4" if single else "f8"
-    work, kinds = Writer(program, "c", single).work, {"b": "u1", "d": "f8", "w": real}
+    work, kinds = StatementWriter(program, "c", single).work, {"b": "u1", "d": "f8", "w": real}
     arrays = [(name, kinds[kind], size) for name, (size, kind) in work.items() if size > 1]
     room: Any = ("work", np.dtype([("unused", "u1"), *arrays], align=True))
     cells: Any = [(cell.name, "f8" if cell.wide else real, cell.start.shape) for cell in program.memory]

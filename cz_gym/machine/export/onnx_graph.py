@@ -24,7 +24,7 @@ OPERATORS = {
 """Operators of the functions; "finite" and "real" are written out."""
 
 
-class Writer:
+class GraphWriter:
     """The nodes and constants of a graph."""
 
     def __init__(self, program: Program) -> None:
@@ -107,7 +107,7 @@ def write_onnx(program: Program, single: bool = False) -> dict[str, bytes]:
     def numbers(name: str, size: int = 1) -> Any:
         return helper.make_tensor_value_info(name, 11, [size])
 
-    writer, start = Writer(program), np.concatenate([cell.start for cell in program.memory])
+    writer, start = GraphWriter(program), np.concatenate([cell.start for cell in program.memory])
     defaults = {port.name: np.array([port.default]) for port in program.settings} | {"memory": start}
     given = [*map(numbers, (port.name for port in (*program.inputs, *program.settings))), numbers("memory", start.size)]
     shown = [port.name for port, _ in program.outputs]

@@ -10,20 +10,20 @@ import numpy as np
 
 from .ports import Alarm, meanings
 from .program import PASSES, Port, Program
-from .writer import Writer, runs
+from .writer import StatementWriter, runs
 
 TEMPLATES = Path(__file__).parent / "templates"
 
 
 def write_c(program: Program, single: bool = False) -> dict[str, str]:
     """The header and the source, by file name."""
-    parts = _parts(program, Writer(program, "c", single))
+    parts = _parts(program, StatementWriter(program, "c", single))
     return {f"cz_{program.name}.{end}": fill_template(f"block.{end}", parts) for end in "hc"}
 
 
 def write_st(program: Program, single: bool = False) -> dict[str, str]:
     """The function block, by file name."""
-    parts = _parts(program, Writer(program, "st", single))
+    parts = _parts(program, StatementWriter(program, "st", single))
     return {f"cz_{program.name}.st": fill_template("block.st", parts)}
 
 
@@ -33,7 +33,7 @@ def fill_template(name: str, parts: Mapping[str, str]) -> str:
     return re.sub(r"(?m)(^ +)?\$\{?(\w+)\}?", lambda part: indent(parts[part[2]], part[1] or ""), text)
 
 
-def _parts(program: Program, writer: Writer) -> dict[str, str]:
+def _parts(program: Program, writer: StatementWriter) -> dict[str, str]:
     """What the templates of a block's files are filled with."""
     own, wide = writer.dialects
 

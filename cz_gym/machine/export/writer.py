@@ -1,7 +1,8 @@
 """The statements of a recorded program in a language: C99, or IEC 61131-3 structured text.
 
-A :class:`Writer` orders the statements and gives their results to a small pool of work arrays, a :class:`Dialect` says
-how a language writes them. An operation whose result is used once, element by element, becomes part of an expression.
+A :class:`StatementWriter` orders the statements and gives their results to a small pool of work arrays, a
+:class:`Dialect` says how a language writes them. An operation whose result is used once, element by element, becomes
+part of an expression.
 """
 
 import re
@@ -116,7 +117,7 @@ class Dialect:
         return self.declare("array" if size > 1 else "number", kind, name, size)
 
 
-class Writer:
+class StatementWriter:
     """The statements of a program in a dialect, with the work arrays and the constants that they need."""
 
     def __init__(self, program: Program, language: str, single: bool) -> None:

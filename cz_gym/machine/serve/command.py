@@ -80,14 +80,14 @@ def _is_loopback(host: str) -> bool:
 async def serving(arguments: argparse.Namespace, door: Any) -> AsyncIterator[tuple[Any, asyncio.Task[None]]]:
     """Run a crystal, its server and page; yields the machine, and a task that ends only if the plant's thread fails."""
     from .crystal import CrystalMachine
-    from .files import Log, StateFile
+    from .files import LogFile, StateFile
     from .machine import Clock, Machine
     from .opcua import Tags, certify, pump
     from .page import Page
 
     if door.remote:
         await certify(arguments.certificates)
-    log = Log(arguments.log, 1e6 * (arguments.log_size or math.inf)) if arguments.log else None
+    log = LogFile(arguments.log, 1e6 * (arguments.log_size or math.inf)) if arguments.log else None
     state = StateFile(arguments.state) if arguments.state else None
     horizon, puller, stage = arguments.hours and arguments.hours * HOUR, arguments.puller, arguments.stage
     process, kind = (BODY, Machine) if stage is None else (CRYSTAL, CrystalMachine)

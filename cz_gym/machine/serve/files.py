@@ -23,7 +23,7 @@ SYNC = 0.5
 """Time after which a log waits for the disk, which takes longer than a step [s]."""
 
 
-class Log:
+class LogFile:
     """A CSV log, up to the last second if the power fails.
 
     The file is made with the first row. Once it has ``largest`` bytes, rows go on in a file of the next number:

@@ -21,13 +21,13 @@ from cz_gym.rendering.view import record_of
 from cz_gym.support.nested import leaves, map_arrays
 from cz_gym.support.units import HOUR, KILO, MM_PER_MIN
 
-from .files import Log, State, StateFile
+from .files import LogFile, State, StateFile
 
 SIZE = (640, 480)
 """Width and height of the picture [px]."""
 
 
-class Alarm(IntFlag):
+class PullerAlarm(IntFlag):
     """The bits of ``alarms``."""
 
     CAMERA = 1
@@ -88,7 +88,7 @@ class Machine:
     tags: tuple[Tag, ...] = TAGS
 
     def __init__(
-        self, config: Config, seed: int, watchdog: float, log: Log | None = None, state: StateFile | None = None
+        self, config: Config, seed: int, watchdog: float, log: LogFile | None = None, state: StateFile | None = None
     ) -> None:
         self.env = CzEnv.from_config(config, "rgb_array", SIZE)
         self.config, self.interval, self.watchdog, self._ranges = (
@@ -153,7 +153,7 @@ class Machine:
         sound = kinds == {tag.name: tag.kind for tag in self.tags} and saved.memory.shape == self._numbers.shape
         if not sound or set(saved.attributes) != set(SAVED):
             raise CzError("this state was saved by another version of cz_gym, or damaged")
-        if saved.tags["alarms"] & Alarm.ENDED:
+        if saved.tags["alarms"] & PullerAlarm.ENDED:
             raise CzError(f"the crystal of this state has ended ({saved.tags['state']}): name another file")
         numbers = iter(saved.memory)
         memory = map_arrays(lambda like: np.array([next(numbers) for _ in like.flat]).reshape(like.shape), self._memory)
@@ -256,8 +256,9 @@ class Machine:
         """Add the tags to the last hour's, and return them."""
         ending, values = self._record.ending, self._fixed | self._read()
         bits = {
-            Alarm.CAMERA: values["valid"] < 0.5, Alarm.HELD: control == "held", Alarm.FALLBACK: control == "fallback",
-            Alarm.MANUAL: control == "manual", Alarm.LATE: self.late, Alarm.ENDED: ending is not None,
+            PullerAlarm.CAMERA: values["valid"] < 0.5, PullerAlarm.HELD: control == "held",
+            PullerAlarm.FALLBACK: control == "fallback", PullerAlarm.MANUAL: control == "manual",
+            PullerAlarm.LATE: self.late, PullerAlarm.ENDED: ending is not None,
         }  # fmt: skip
         values |= dict(zip(SETPOINTS, self._active, strict=True)) | {
             "time_s": self.k * self.interval, "state": "growing" if ending is None else ending.value.lower(),

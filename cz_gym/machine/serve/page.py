@@ -17,7 +17,7 @@ from cz_gym.errors import CzError
 from cz_gym.machine.export.ports import SETPOINTS
 from cz_gym.rendering.canvas import load
 
-from .machine import Alarm, Machine
+from .machine import Machine, PullerAlarm
 from .opcua import Account, Door, in_address
 
 HTML = Path(__file__).parent / "page.html"
@@ -114,7 +114,7 @@ class Page:
         return web.json_response({
             "now": now,
             "hour": [row for row in rows if row["step"] > after],
-            "alarms": [alarm.name for alarm in Alarm if now["alarms"] & alarm],
+            "alarms": [alarm.name for alarm in PullerAlarm if now["alarms"] & alarm],
             "events": list(self.door.events)[-5:],
             "limits": self.machine.limits,
             "user": account.name,

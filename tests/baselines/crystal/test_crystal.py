@@ -11,11 +11,11 @@ from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.errors import CzError
 from cz_gym.evaluation.crystal_metrics import crystal_metrics
-from cz_gym.evaluation.protocol import TRAINING_SEEDS, Row
+from cz_gym.evaluation.protocol import TRAINING_SEEDS, Case
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.meniscus import HURLE
 
-CROWN = Row("crown", "randomized", "a crown", process=CRYSTAL, stage="crown")
+CROWN = Case("crown", "randomized", "a crown", process=CRYSTAL, stage="crown")
 
 
 @pytest.mark.slow

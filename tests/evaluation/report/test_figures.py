@@ -11,7 +11,7 @@ from cz_gym.baselines import OpenLoop
 from cz_gym.baselines.registry import CONTROLLERS
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metric_names
-from cz_gym.evaluation.protocol import find_row
+from cz_gym.evaluation.protocol import find_case
 from cz_gym.evaluation.report.canvas import COLOURS, COLUMNS, DPI, chosen, styles_of
 from cz_gym.evaluation.report.figures import NAMED, draw_figures
 from cz_gym.evaluation.report.markdown import brief
@@ -53,7 +53,7 @@ def test_figure_and_short_table_show_who_is_quoted_the_best_agents_and_one_s_own
     assert names(chosen(everyone(), COLUMNS)) == usual
     mine = [*everyone(), sample("mine", 50.0, own=True)]
     assert {"paper", "mine", "gradient"} < set(names(chosen(mine, COLUMNS)))
-    lines = brief([summarise(find_row("nominal"), everyone())]).split("\n\n")[0].splitlines()
+    lines = brief([summarise(find_case("nominal"), everyone())]).split("\n\n")[0].splitlines()
     shown = [line.split(" | ")[0].strip("| ") for line in lines[2:]]
     assert [name for name in shown if "*" not in name] == [*usual, "sac", "ppo-plain"]
     assert [name for name in shown if "*" in name] == ["*classical*", "*learned from the reward*"]
@@ -69,7 +69,7 @@ def test_no_two_controllers_look_alike():
 def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_formula():
     results = []
     for name in ("nominal", "randomized"):
-        row = find_row(name)
+        row = find_case(name)
         run = rollout(OpenLoop(), make_config(name, horizon=600.0, **PLAIN), row.seeds(2))
         who = ["a $\\frac$ b", *(f"c{i}" for i in range(COLUMNS))]
         results.append(summarise(row, [Sample.of(contender(each, training_seeds=(1,)), [run]) for each in who]))

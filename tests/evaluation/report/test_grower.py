@@ -10,7 +10,7 @@ from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.registry import find_controller
 from cz_gym.body.plant import make_puller
 from cz_gym.commands import benchmark
-from cz_gym.evaluation.protocol import find_row
+from cz_gym.evaluation.protocol import find_case
 from cz_gym.evaluation.report import grower
 from cz_gym.evaluation.report.markdown import markdown, terminal
 from cz_gym.evaluation.report.page import page
@@ -19,7 +19,7 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.machine.puller import find_puller
 
 NAMES = ("open-loop", "pid-conventional", "paper-tuned")
-ROW = replace(find_row("randomized"), puller=find_puller("silicon-300mm"), tolerance=0.4e-3)
+ROW = replace(find_case("randomized"), puller=find_puller("silicon-300mm"), tolerance=0.4e-3)
 
 
 @pytest.fixture(scope="module")

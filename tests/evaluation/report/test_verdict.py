@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from cz_gym.evaluation.protocol import Row
+from cz_gym.evaluation.protocol import Case
 from cz_gym.evaluation.report import tables
 from cz_gym.evaluation.report.tables import FEWEST, best_of_each_kind, verdict
 from cz_gym.evaluation.results import Result, Sample
@@ -30,7 +30,7 @@ def made(**scenarios):
         samples = tuple(Sample(each, seeds, np.zeros((1, 1, 1)), 0.0) for each in who)
         means = {"lqg": {"rmse_mm": Estimate(5.0, (4.0, 6.0), 9)}}
         means |= {agent: {"rmse_mm": Estimate(5.0 + each.mean, None, 9)} for agent, each in verdicts.items()}
-        results.append(Result(Row(name, "randomized", ""), samples, means, {}, {}, {}, {}, "lqg", verdicts))
+        results.append(Result(Case(name, "randomized", ""), samples, means, {}, {}, {}, {}, "lqg", verdicts))
     return results
 
 

@@ -13,8 +13,8 @@ from cz_gym.errors import CzError
 from cz_gym.machine.export.ports import SETPOINTS
 from cz_gym.machine.puller import PullerFile
 from cz_gym.machine.serve.crystal import CrystalMachine
-from cz_gym.machine.serve.files import Log, StateFile
-from cz_gym.machine.serve.machine import Alarm, Clock, Machine
+from cz_gym.machine.serve.files import LogFile, StateFile
+from cz_gym.machine.serve.machine import Clock, Machine, PullerAlarm
 
 PULL, HEATER = SETPOINTS
 
@@ -71,11 +71,11 @@ def test_a_crystal_goes_on_from_its_state_as_if_nothing_had_happened(tmp_path):
     """The process ends after a row was logged and before its state was saved; the log is one of many parts."""
     whole = drive(machine(watchdog=30.0, horizon=1500.0), 300)
     log, file = tmp_path / "log.csv", StateFile(tmp_path / "state")
-    first = machine(30.0, Log(log, 4096), file, horizon=1500.0)
+    first = machine(30.0, LogFile(log, 4096), file, horizon=1500.0)
     drive(first, 195)
     first._state = None
     drive(first, 1)
-    second = machine(30.0, Log(log, 4096), file, horizon=1500.0)
+    second = machine(30.0, LogFile(log, 4096), file, horizon=1500.0)
     assert second.k == 195, "the fallback controls, and has a memory"
     assert drive(second, 105) == whole[195:]
     parts = [log, *sorted(tmp_path.glob("log-?.csv"))]
@@ -109,7 +109,7 @@ def test_setpoints_that_are_not_renewed_are_held_and_then_the_fallback_takes_ove
     one.offer({PULL: 1.5, HEATER: 57.5, "watchdog": 0})
     rows = [one.step() for _ in range(8)]
     assert [row["control"] for row in rows] == ["client", *["held"] * 5, *["fallback"] * 2]
-    assert [row["alarms"] for row in rows] == [0, *[Alarm.HELD] * 5, *[Alarm.FALLBACK] * 2]
+    assert [row["alarms"] for row in rows] == [0, *[PullerAlarm.HELD] * 5, *[PullerAlarm.FALLBACK] * 2]
     assert [row["pull_speed_mm_per_min"] for row in rows[:7]] == pytest.approx([1.5] * 7), "its first is the held one"
     rows += [one.step() for _ in range(1900)]
     moves = np.abs(np.diff([row["pull_speed_mm_per_min"] for row in rows[6:]]))
@@ -127,7 +127,7 @@ def test_the_operator_takes_control_and_gives_it_back():
     assert one.by_hand({PULL: 1.4, HEATER: 57.0}) == {}
     assert one.offer({"watchdog": 0}) == {"watchdog": "the operator has control"}
     rows = [one.step() for _ in range(10)]
-    assert {(row["control"], row["alarms"]) for row in rows} == {("manual", Alarm.MANUAL)}
+    assert {(row["control"], row["alarms"]) for row in rows} == {("manual", PullerAlarm.MANUAL)}
     assert [row["pull_speed_mm_per_min"] for row in rows] == pytest.approx([1.4] * 10)
     assert one.by_hand({}) == {}
     assert [one.step()["control"] for _ in range(3)] == ["held", "fallback", "fallback"]
@@ -138,7 +138,7 @@ def test_a_lost_crystal_raises_an_alarm():
     while not one.over:
         one.offer({PULL: 0.0, "watchdog": one.k})
         tags = one.step()
-    assert tags["alarms"] & Alarm.ENDED
+    assert tags["alarms"] & PullerAlarm.ENDED
     assert "frozen" in tags["state"] or "lost" in tags["state"]
 
 
@@ -164,7 +164,7 @@ def test_a_clock_makes_up_for_what_it_missed_and_does_not_drift():
     lag = np.array(times) - begin - np.arange(1, len(times) + 1) * 5.0 / 400.0
     assert lag.min() > -0.02
     assert lag[60:].min() < 0.05, "it has caught up"
-    assert any(row["alarms"] & Alarm.LATE for row in one.hour)
+    assert any(row["alarms"] & PullerAlarm.LATE for row in one.hour)
     assert [row["step"] for row in one.hour] == list(range(one.k + 1))
 
 

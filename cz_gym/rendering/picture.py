@@ -40,7 +40,7 @@ def layout(box: Box) -> Layout:
     )
 
 
-class Scene:
+class Picture:
     """Draws records as pictures of one size."""
 
     def __init__(self, width: int, height: int) -> None:
