@@ -1,8 +1,10 @@
 """Why SAC learns slowly: ``python -m studies.critic`` trains the recipe ``sac``, changed by FIELD=VALUE.
 
 SAC follows its critic's slope by the action. After training this slope is compared with the true one: from each of many
-crystals the first action is changed by a little, up and down, and the agent goes on; both futures meet the same
-disturbances, so half the difference of their discounted rewards is the slope.
+crystals the first action is changed by a little, up and down, and the agent goes on; both runs meet the same
+disturbances, so half the difference of their discounted rewards is the slope. A critic can only know the mean over
+what noise is still to come: the true slope is the mean over several such futures, and the ceiling says how well that
+mean is known.
 """
 
 import argparse
@@ -19,6 +21,7 @@ from gymnasium.vector import AutoresetMode
 from cz_gym import CzVectorEnv
 from cz_gym.agents.training.recipes import SAC
 from cz_gym.agents.training.validation import JUDGING, validate
+from cz_gym.env import EnvState
 from cz_gym.errors import CzError
 from cz_gym.evaluation.report.tables import markdown
 from cz_gym.support.atomic_files import write_files
@@ -31,15 +34,24 @@ BEFORE, AFTER = 150, 240
 """Actions before the changed one, and those whose rewards count."""
 CHANGE = 0.02
 """Change of the action [-]."""
+FUTURES = 8
+"""Continuations of each crystal with other noise, over which the true slope is a mean; even."""
+RESAMPLES = 1000
+"""Resamples of the crystals for the intervals."""
 TAIL = 0.98
 """Share of the crystals that count: a crystal that is nearly lost has slopes a thousand times as large [-]."""
 SCENARIOS = ("randomized", "hard", "puller")
 TITLE = "# What SAC's critics know of an action"
-HEADS = ("changed", "updates", "cosine, pull", "cosine, heater", *(f"cost, {name}" for name in SCENARIOS), "lost [%]")
+DRIVES = "pull", "heater"
+COSINES = tuple(text.format(drive) for drive in DRIVES for text in ("cosine, {}", "ceiling, {}"))
+HEADS = ("changed", "updates", *COSINES, *(f"cost, {name}" for name in SCENARIOS), "lost [%]")
 
 
 def slopes(model: Any, recipe: SAC) -> tuple[Floats, Floats]:
-    """True slopes of the discounted rewards by the action, and the critics', each of shape (crystals, 2)."""
+    """True slopes of the discounted rewards by the action, and the critics'.
+
+    The true ones have shape (futures, crystals, 2), the critics' (crystals, 2).
+    """
     import torch
 
     from cz_gym.sb3 import CzVecEnv
@@ -55,17 +67,31 @@ def slopes(model: Any, recipe: SAC) -> tuple[Floats, Floats]:
     action, states = model.predict(observation, deterministic=True)[0], env.env.get_state()
     ahead = CzVectorEnv.from_config(*settings)
     ahead.reset(seed=FIRST_SEED)
-    true, grows = np.zeros(action.shape), np.ones(CRYSTALS, np.bool_)
-    for drive in range(action.shape[1]):
-        change = CHANGE * np.eye(action.shape[1])[drive]
-        ahead.set_state(states)
-        more, one = earned(model, recipe, ahead, action + change)
-        ahead.set_state(states)
-        less, other = earned(model, recipe, ahead, action - change)
-        true[:, drive], grows = (more - less) / (2.0 * CHANGE), grows & one & other
+    true, grows = np.zeros((FUTURES, *action.shape)), np.ones(CRYSTALS, np.bool_)
+    for future in range(FUTURES):
+        begin = with_noise_of(states, future)
+        for drive in range(action.shape[1]):
+            change = CHANGE * np.eye(action.shape[1])[drive]
+            ahead.set_state(begin)
+            more, one = earned(model, recipe, ahead, action + change)
+            ahead.set_state(begin)
+            less, other = earned(model, recipe, ahead, action - change)
+            true[future, :, drive], grows = (more - less) / (2.0 * CHANGE), grows & one & other
     at = torch.as_tensor(action).requires_grad_(True)
     torch.autograd.backward(torch.cat(model.critic(torch.as_tensor(observation), at), 1).mean(1).sum())
-    return true[grows], np.asarray(at.grad, np.float64)[grows]
+    return true[:, grows], np.asarray(at.grad, np.float64)[grows]
+
+
+def with_noise_of(states: Sequence[EnvState], shift: int) -> tuple[EnvState, ...]:
+    """The states with the random streams of the crystals ``shift`` places on: other fluctuations and readings follow,
+    while the disturbances that were drawn for a crystal at its beginning stay.
+    """
+    changed = []
+    for i, state in enumerate(states):
+        slot = state.slot.slot.copy()
+        slot["streams"] = states[(i + shift) % len(states)].slot.slot["streams"]
+        changed.append(replace(state, slot=replace(state.slot, slot=slot)))
+    return tuple(changed)
 
 
 def earned(model: Any, recipe: SAC, env: CzVectorEnv, action: Floats) -> tuple[Floats, npt.NDArray[np.bool_]]:
@@ -82,13 +108,32 @@ def earned(model: Any, recipe: SAC, env: CzVectorEnv, action: Floats) -> tuple[F
 
 
 def cosines(true: Floats, learned: Floats) -> Floats:
-    """Cosine between both slopes over all crystals, of each drive [-]; NaN without any."""
+    """Cosine between two slopes over all crystals, of each drive [-]; NaN without any."""
     if not len(true):
         return np.full(true.shape[1], np.nan)
     usual = (np.abs(true) <= np.quantile(np.abs(true), TAIL, axis=0)).all(axis=1)
     true, learned = true[usual], learned[usual]
     cosine: Floats = (true * learned).sum(0) / np.sqrt((true**2).sum(0) * (learned**2).sum(0))
     return cosine
+
+
+def ceilings(true: Floats) -> Floats:
+    """Largest cosine that a critic can have with the mean of these futures, of each drive [-]: that of the mean over
+    all futures, as one half of them and the other say (Spearman and Brown's formula).
+    """
+    halves = cosines(true[::2].mean(0), true[1::2].mean(0)).clip(0.0, None)
+    return np.asarray(np.sqrt(2.0 * halves / (1.0 + halves)))
+
+
+def cells(true: Floats, learned: Floats) -> list[str]:
+    """Cosine with its 95 % interval over crystals, and ceiling, of each drive."""
+    mean, random, n = true.mean(0), np.random.default_rng(0), len(learned)
+    draws = [random.integers(0, n, n) for _ in range(RESAMPLES)] if n else []
+    spread = np.array([cosines(mean[draw], learned[draw]) for draw in draws] or [cosines(mean, learned)])
+    ends, texts = np.percentile(spread, (2.5, 97.5), axis=0), list[str]()
+    for cosine, low, high, ceiling in zip(cosines(mean, learned), *ends, ceilings(true), strict=True):
+        texts += [f"{cosine:.2f} [{low:.2f}, {high:.2f}]", f"{ceiling:.2f}"]
+    return texts
 
 
 def row(changes: Sequence[str], seed: int) -> tuple[str, ...]:
@@ -103,14 +148,15 @@ def row(changes: Sequence[str], seed: int) -> tuple[str, ...]:
     return (
         " ".join(changes) or "nothing",
         str(model._n_updates),
-        *(f"{each:.2f}" for each in cosines(*slopes(model, recipe))),
+        *cells(*slopes(model, recipe)),
         *(f"{each.cost:.4f}" for each in judged),
         " / ".join(f"{100.0 * each.failure_rate:.1f}" for each in judged),
     )
 
 
 def changed(changes: Sequence[str]) -> SAC:
-    """The recipe with fields of other values; CzError for one that it does not have."""
+    """The recipe with fields of other values, as ``train.py --steps`` changes it for other steps; CzError for a field
+    that it does not have."""
     recipe, numbers = SAC(), {each.name for each in fields(SAC) if isinstance(each.default, int | float)}
     given = dict[str, Any]()
     for change in changes:
@@ -121,7 +167,7 @@ def changed(changes: Sequence[str]) -> SAC:
             given[name] = type(getattr(recipe, name))(float(value))
         except (ValueError, OverflowError):
             raise CzError(f"{name}={value!r}: not a number that it can be") from None
-    return replace(recipe, **given)
+    return replace(recipe.with_steps(given.pop("steps", recipe.steps)), **given)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,6 +1,7 @@
 """Cost, radius error and losses of an agent on validation crystals."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from cz_gym.config import Config
 from cz_gym.evaluation.metrics import Metrics, metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.vector import CzVectorEnv
 
 from .recipes import Recipe
 
@@ -59,13 +61,23 @@ def validate(policy: Any, config: Config, seeds: Sequence[int]) -> Validation:
 def references(make_controller: Callable[[str, Config], Any], recipe: Recipe) -> References:
     """RMSEs of the classical controllers on the crystals of a recipe; ``make_controller`` makes one by its name."""
     config = replace(recipe.config, observation="measured", action="direct")
-    # Classical controllers are designed for one scenario.
-    design = config if len(config.scenario.scenarios) == 1 else config.with_scenario("randomized")
-    rmses = {}
-    for name in REFERENCES[config.process.name]:
-        policy = make_controller(name, design)
-        rmses[name] = validate(policy, config, PICKING).rmse_mm, validate(policy, config, JUDGING).rmse_mm
-    return rmses
+
+    def rmse_mm(name: str, seeds: Sequence[int]) -> float:
+        return _by_scenario(lambda own: make_controller(name, own), config, seeds)
+
+    return {name: (rmse_mm(name, PICKING), rmse_mm(name, JUDGING)) for name in REFERENCES[config.process.name]}
+
+
+def _by_scenario(make: Callable[[Config], Any], config: Config, seeds: Sequence[int]) -> float:
+    """Mean RMSE [mm] of a controller with its design for each crystal's own scenario, as in the benchmark."""
+    with closing(CzVectorEnv.from_config(config, len(seeds))) as env:
+        _, info = env.reset(seed=list(seeds))
+    drawn, total = info.get("scenario", [config.scenario.name] * len(seeds)), 0.0
+    for scenario in config.scenario.scenarios:
+        if own := [seed for seed, name in zip(seeds, drawn, strict=True) if name == scenario.name]:
+            alone = config.with_scenario(scenario)
+            total += len(own) * validate(make(alone), alone, own).rmse_mm
+    return total / len(seeds)
 
 
 def costs(measured: Metrics) -> Floats:

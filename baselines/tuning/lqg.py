@@ -13,7 +13,8 @@ from cz_gym.baselines.lqg.multiple_model import Hypotheses
 from cz_gym.baselines.lqg.ring_model import RingModel
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Scenario, Sensor
-from cz_gym.episodes.scenarios import RANDOMIZED
+from cz_gym.episodes.mixture import Distribution
+from cz_gym.episodes.scenarios import RANDOMIZED, find_distribution
 from cz_gym.errors import CzError
 from cz_gym.machine.puller import DEFAULT
 
@@ -28,9 +29,8 @@ it the loop is unstable on some hot zones, and its own oscillation then speaks f
 ACTIVITIES = 0.005, 0.008, 0.013, 0.02, 0.03
 """Largest pull step RMS [mm/min] that the members of the family are tuned for."""
 IN_TABLE = 0.02
-"""Pull step RMS [mm/min] of the family's member that runs by default: on ``randomized`` it is about as active as the
-agents, so their radius errors can be compared. On ``hard`` the agents are more active. On a puller of the user's own
-its filter alone is searched, and the other LQGs have the same one with their own weights."""
+"""Pull step RMS [mm/min] of the family's member that runs by default, the one of least radius error on most scenarios. On
+a puller of the user's own its filter alone is searched, and the other LQGs have the same one with their own weights."""
 PARAMETERS = tuple(Parameter(path, 1e-4, 1e4) for path in by_scenario("lqg")[RANDOMIZED.name])
 ON_PULLER = tuple(
     Parameter(path, 0.0, 0.0)
@@ -155,6 +155,23 @@ def family_name(activity: float) -> str:
     return f"lqg-at-{activity:g}"
 
 
+@dataclass(frozen=True, kw_only=True)
+class OneDesign(TunedLQG):
+    """An LQG with one design for every scenario: like an agent it is not told which one it meets."""
+
+    def design(self, scenario: Scenario) -> LQGDesign:
+        """The design, whatever the scenario; it has no model of a camera."""
+        return super().design(RANDOMIZED)
+
+    def crystals(self, scenario: Scenario) -> Distribution:
+        """The crystals that agents learn from."""
+        return find_distribution("all")
+
+    def goal(self, scenario: Scenario) -> Goal:
+        """As of every LQG; no crystal of any scenario may be lost."""
+        return replace(super().goal(scenario), survive=tuple(each.name for each in self.crystals(scenario).scenarios))
+
+
 FILTER = family_name(IN_TABLE)
 """Name of the LQG whose filter is searched on a puller."""
 BEST_RETURN = TunedLQG(
@@ -182,6 +199,14 @@ LQGS = (
             searched_on_puller=activity == IN_TABLE,
         )
         for activity in ACTIVITIES
+    ),
+    OneDesign(
+        name="lqg-one-design",
+        meaning="lqg with one design for every scenario: like agents it is not told which one it meets",
+        limits={"randomized": (0.3, 0.02)},
+        by_return=True,
+        on_puller=False,
+        searched_on_puller=False,
     ),
 )
 """Every tuned LQG, in the order of tables."""
