@@ -13,7 +13,7 @@ COMMANDS = {
     "benchmark": ("cz_gym.commands.benchmark", "compare controllers and agents on the same crystals"),
     "tune": ("cz_gym.commands.tune", "search settings of controllers, or design them for a puller"),
     "identify": ("cz_gym.machine.identify.command", "estimate a puller's numbers from its log"),
-    "puller": ("cz_gym.machine.describe", "write and check puller files"),
+    "puller": ("cz_gym.machine.describe", "print what a puller file implies"),
     "recipe": ("cz_gym.commands.recipe", "set points of a whole crystal against its length"),
     "export": ("cz_gym.machine.export.command", "write a controller or agent as code for a PLC"),
     "serve": ("cz_gym.machine.serve.command", "run a virtual puller on OPC UA"),
@@ -47,7 +47,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("cz_gym"):
             raise
-        print(f"cz-gym: {error}", file=sys.stderr)
+        extra = ': pip install ".[benchmark]"' if error.name in ("matplotlib", "plotly", "tqdm") else ""
+        print(f"cz-gym {word}: {error}{extra}", file=sys.stderr)
         return 2
     code: int = module.main(others[:-1])
     return code

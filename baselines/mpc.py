@@ -97,6 +97,11 @@ class EkfMpc(LQG):
         casadi()
 
     @property
+    def exportable(self) -> bool:
+        """It solves an optimisation problem in each step."""
+        return False
+
+    @property
     def hash(self) -> str:
         """Hash of its settings (16 hex digits)."""
         plant = self.control_interval, self.parameters, self.meniscus.name
@@ -255,11 +260,9 @@ def best_corrections(H: Floats, g: Floats, prediction: Prediction, blocks: tuple
 
 
 def casadi() -> Any:
-    """The module casadi; ImportError in one line names the extra that contains it."""
-    try:
-        import casadi
-    except ImportError:
-        raise ImportError("this needs the package casadi: pip install '.[mpc]'") from None
+    """The module casadi, of the extra mpc; commands name the extra if it is missing."""
+    import casadi
+
     return casadi
 
 

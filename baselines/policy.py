@@ -91,6 +91,11 @@ class MeasuredController(ABC):
         """What an action of 1 moves the heater by [W]."""
         return self.puller.power_range
 
+    @property
+    def exportable(self) -> bool:
+        """Whether its step is one straight line of arithmetic, which other languages can have too."""
+        return True
+
     @cached_property
     def made_for(self) -> MadeFor | None:
         """The environment that takes its actions; None: every one does."""

@@ -5,6 +5,7 @@ Importing this package registers ``Cz-v0`` and ``CzCrystal-v0``; ``gym.make("cz_
 
 import sys
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 try:
@@ -25,6 +26,10 @@ from .config import Config
 from .env import CzEnv, EnvState
 from .observation import decode
 from .vector import CzVectorEnv
+
+_here = Path(__file__).parent
+if not (_here / "baselines").exists():  # in a clone, whose folders agents and baselines stand beside this one
+    __path__ += [str(_here.parent)]
 
 __version__ = "0.2.0"
 ENV_ID = "Cz-v0"

@@ -195,7 +195,7 @@ def make_config(
     stage: Any = None,
 ) -> Config:
     """Check the arguments of the environment; CzError names what was given and what is allowed."""
-    machine, process = find_puller(puller), process or BODY
+    machine, process = find_puller(puller), needs(Process, process or BODY, "cz_gym.body.process.BODY is one")
     if puller is not None and parameters is not None:
         raise CzError(f"parameters are those of the puller {machine.name!r}: give one of both")
     drawn_from = adapt_scenario(machine, find_distribution(scenario))

@@ -102,6 +102,11 @@ class LQG(MeasuredController):
     hypotheses: Hypotheses | None = None
     """Fluctuations that a bank of filters considers possible; None for a single filter."""
 
+    @property
+    def exportable(self) -> bool:
+        """Whether it has a single filter."""
+        return self.hypotheses is None
+
     @cached_property
     def gains(self) -> Gains:
         """Gains of the design point."""

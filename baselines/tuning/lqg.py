@@ -12,8 +12,8 @@ from cz_gym.baselines.lqg.controller import LQG, LQGDesign
 from cz_gym.baselines.lqg.multiple_model import Hypotheses
 from cz_gym.baselines.lqg.ring_model import RingModel
 from cz_gym.config import Config
-from cz_gym.episodes.scenario import Scenario, Sensor
 from cz_gym.episodes.mixture import Distribution
+from cz_gym.episodes.scenario import Scenario, Sensor
 from cz_gym.episodes.scenarios import RANDOMIZED, find_distribution
 from cz_gym.errors import CzError
 from cz_gym.machine.puller import DEFAULT
@@ -29,7 +29,7 @@ it the loop is unstable on some hot zones, and its own oscillation then speaks f
 ACTIVITIES = 0.005, 0.008, 0.013, 0.02, 0.03
 """Largest pull step RMS [mm/min] that the members of the family are tuned for."""
 IN_TABLE = 0.02
-"""Pull step RMS [mm/min] of the family's member that runs by default, the one of least radius error on most scenarios. On
+"""Pull step RMS [mm/min] of the family's member that runs by default, of less radius error than any that moves less. On
 a puller of the user's own its filter alone is searched, and the other LQGs have the same one with their own weights."""
 PARAMETERS = tuple(Parameter(path, 1e-4, 1e4) for path in by_scenario("lqg")[RANDOMIZED.name])
 ON_PULLER = tuple(

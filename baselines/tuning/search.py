@@ -180,6 +180,7 @@ class Search:
             with naming(path):
                 file = json.loads(path.read_text("utf-8"))
             parameters, puller = file["parameters"], file.get("puller", DEFAULT.label)
+            crystals = file["scenario_hash"], file.get("control_interval_s", self.config.puller.control_interval)
             self.trials = [Trial(tuple(values), score, facts) for values, score, facts in file["history"]]
             episodes = file["budget"]["episodes"]
         except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -188,6 +189,8 @@ class Search:
             raise CzError(f"{path}: its parameters are not those of {self.controller}: remove it to begin anew")
         if puller != self.config.puller.label:
             raise CzError(f"{path}: found for puller {puller}: remove it to begin anew")
+        if crystals != (self.config.scenario.hash, self.config.control_interval):
+            raise CzError(f"{path} was begun on other crystals or at another control interval: write another file")
         if episodes != self.budget["episodes"]:
             raise CzError(f"{path} was begun with {episodes} episodes; ask for as many, or write another file")
 
@@ -202,6 +205,8 @@ class Search:
         }
         if self.config.puller != DEFAULT:
             about["puller"] = self.config.puller.label
+        if self.config.control_interval != self.config.puller.control_interval:
+            about["control_interval_s"] = self.config.control_interval
         lines = ",\n  ".join(map(json.dumps, self.trials))
         head = json.dumps({**about, **choice, "parameters": self._paths}, indent=1).removesuffix("\n}")
         write_files({self.path: f'{head},\n "history": [\n  {lines}\n ]\n}}\n'.encode()})

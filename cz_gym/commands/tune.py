@@ -7,6 +7,7 @@ Choices and histories are stored in a folder beside the file.
 
 import argparse
 import json
+import shlex
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -24,7 +25,7 @@ from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.errors import CzError
 from cz_gym.evaluation.processes import side_by_side
 from cz_gym.machine.puller import FOLDER, PullerFile, chosen_puller
-from cz_gym.support.command_line import OneLineParser, between
+from cz_gym.support.command_line import OneLineParser, between, shown
 from cz_gym.support.names import unknown
 
 _ALL: tuple[Tuned | TunedCrystal, ...] = (*PIDS, *LQGS, *CRYSTALS)
@@ -57,7 +58,8 @@ def _tune(given: argparse.Namespace) -> None:
     if given.puller is not None:
         if given.scenario or given.control_interval:
             raise CzError("a search for a --puller has scenarios and interval of its own: leave both options out")
-        return for_puller(given, chosen_puller(given.puller))
+        for_puller(given, chosen_puller(given.puller))
+        return
     if given.cluster:
         raise CzError("--cluster shares the searches for a --puller between machines: one search is one task")
     if given.controller is None:
@@ -76,10 +78,12 @@ def _tune(given: argparse.Namespace) -> None:
     else:
         config = make_config(tuned.crystals(scenario), None, "measured", interval, action="direct")
         search = Search(tuned.name, tuned.goal(scenario), config, trials, episodes, measure)
-    chosen = search.tune((given.out or Path("runs/tuning")) / file_name(tuned.name, name))
-    print(f"{tuned.name} on {name}: {chosen.score:.4f} {chosen.facts}")
-    print(search.settings(chosen.values))
-    return None
+    path = (given.out or Path("runs/tuning")) / file_name(tuned.name, name)
+    chosen = search.tune(path)
+    print(f"{tuned.name} on {name}: score {chosen.score:.4f} on validation crystals")
+    for parameter, value in zip(search.goal.parameters, chosen.values, strict=True):
+        print(f"  {parameter.path} = {value:.6g}")
+    print(f"wrote {shown(path)}")
 
 
 def tunable(given: argparse.Namespace) -> dict[str, Tuned | TunedCrystal]:
@@ -121,7 +125,7 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
                 said, among = f"RMSE {figures['rmse_mm']:.3f} mm", "half of them with other hot zones"
             lost = f"{100 * figures['failure_rate']:.0f} % lost"
             bar.write(f"{tasks[number][0].name}: {said}, {lost} on validation crystals, {among}")
-    command = f"cz-gym benchmark --puller {puller.file or puller.name}"
+    command = f"cz-gym benchmark --puller {shlex.quote(str(puller.file or puller.name))}"
     moved = "" if folder == beside else f"moved to {beside}, "
     print(f"wrote {folder}: {moved}{command}{f' --env {CRYSTAL.name}' if crystals else ''} runs what was designed")
 

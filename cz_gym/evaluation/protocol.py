@@ -86,9 +86,14 @@ class Case:
         r_0, v_0 = config.parameters.r_0 / MM, config.parameters.v_0 / MM_PER_MIN
         return f"{name}: radius {r_0:g} mm, pull speed {v_0:g} mm/min, plant {config.plant_hash}"
 
+    @property
+    def deterministic(self) -> bool:
+        """Whether all its crystals are the same."""
+        return find_scenario(self.scenario).deterministic
+
     def seeds(self, episodes: int) -> range:
         """Return the seeds of the first ``episodes`` crystals, of one if the scenario is deterministic."""
-        number = 1 if find_scenario(self.scenario).deterministic else min(episodes, self.most)
+        number = 1 if self.deterministic else min(episodes, self.most)
         return range(self.first_seed, self.first_seed + number)
 
 
@@ -175,7 +180,7 @@ def contract_hash(cases: Sequence[Case]) -> str:
     from .crystal_metrics import kind_of
     from .metrics import ALMOST, PULL_WINDOW, names_of
 
-    random = [case.config() for case in cases if not find_scenario(case.scenario).deterministic]
+    random = [case.config() for case in cases if not case.deterministic]
     configs = random or [case.config() for case in cases]
     parts = [*sorted(config.hash for config in configs), configs[0].reward_hash, *names_of(kind_of(cases[0].process))]
     parts += [str(number) for number in (PULL_WINDOW, PULL_TOLERANCE, TOLERANCE, ALMOST)]

@@ -10,11 +10,12 @@ import numpy as np
 from cz_gym.body.linearisation import STATES, linearise, radius_model
 from cz_gym.body.plant import make_puller
 from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
+from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.quantities import MACHINE
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.units import CELSIUS, HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
-from .puller import DEFAULT, PullerFile, doubts, find_puller, value_of
+from .puller import PullerFile, defaults_of, doubts, find_puller, value_of
 
 
 def implied(puller: PullerFile) -> dict[str, str]:
@@ -30,8 +31,9 @@ def implied(puller: PullerFile) -> dict[str, str]:
         "heater power": f"{p.Q_H_0 / KILO:.4g} kW",
         "temperatures": ", ".join(f"{name} {T:.0f} K ({T - CELSIUS:.0f} °C)" for name, T in temperatures),
         "meniscus": f"{p.h_0 / MM:.3g} mm high, within {HEIGHT_MIN / MM:.3g} to {HEIGHT_MAX_IN_A * p.a / MM:.3g} mm",
-        "radius": f"poles {model.poles[0]:.3g} and {model.poles[1]:.3g} rad/s in Model I; lost at "
-        f"{puller.radius_limit / MM:.3g} mm from the reference",
+        "radius": f"poles {model.poles[0]:.3g} and {model.poles[1]:.3g} rad/s in Model I at a constant melt "
+        f"temperature; lost at {puller.radius_limit / MM:.3g} mm from the reference",
+        "left alone": ", ".join(f"Model {name} {_left_alone(q, mix)}" for name, mix in (("I", 1.0), ("II", 0.0))),
         "bright ring": f"{p.ring_bias / MM:.3g} mm outside the crystal, zero at {model.zero:.3g} rad/s",
         "hot zone": f"time constants {', '.join(f'{lag:.3g}' for lag in lags)} min",
         "pull speed": f"{(2.0 * q.v_0 - fastest) / MM_PER_MIN:.4g} to {fastest / MM_PER_MIN:.4g} mm/min"
@@ -41,6 +43,12 @@ def implied(puller: PullerFile) -> dict[str, str]:
         "sensors": f"every {puller.control_interval:g} s"
         + _stated(puller, "camera_noise", "pyrometer_noise", "latency", "pyrometer_filter"),
     }
+
+
+def _left_alone(parameters: Parameters, mix: float) -> str:
+    """What a small error does without a controller, by the fastest pole of the plant with its melt."""
+    growth = np.linalg.eigvals(linearise(make_puller(parameters, mix)).A).real.max()
+    return f"grows to e times its size in {1.0 / growth / MINUTE:.3g} min" if growth > 0.0 else "dies out"
 
 
 def _stated(puller: PullerFile, *symbols: str) -> str:
@@ -63,10 +71,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> None:
     puller = find_puller(given.puller)
-    absent = {each: value_of(DEFAULT, each) for each in MACHINE.values() if each.key in puller.missing}
+    taken, sizes = defaults_of(puller), {each.key: each.size for each in MACHINE.values()}
     lines = implied(puller) | {
-        "as the default": ", ".join(f"{k.key} = {v / k.size:.10g}" for k, v in absent.items() if v is not None),
-        "as the scenario": ", ".join(k.key for k, v in absent.items() if v is None),
+        "as the default": ", ".join(f"{key} = {value / sizes[key]:.10g}" for key, value in taken.items()),
+        "as the scenario": ", ".join(key for key in puller.missing if key not in taken),
     }
     print(f"puller {puller.label}")
     for heading, text in lines.items():

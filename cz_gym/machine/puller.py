@@ -196,11 +196,17 @@ def find_puller(given: str | Path | PullerFile | None) -> PullerFile:
 def chosen_puller(given: str | None) -> PullerFile:
     """The puller that a command line names; lines on stderr tell of keys that its file lacks, and of doubts."""
     puller = find_puller(given)
-    if puller.missing:
-        print(f"puller {puller.label}: the default's values for {', '.join(puller.missing)}", file=sys.stderr)
+    if taken := defaults_of(puller):
+        print(f"puller {puller.label}: the default's values for {', '.join(taken)}", file=sys.stderr)
     for doubt in doubts(puller):
         print(f"puller {puller.label}: {doubt}", file=sys.stderr)
     return puller
+
+
+def defaults_of(puller: PullerFile) -> dict[str, Any]:
+    """What a puller's file lacks and the default puller has, by key [SI units]; the rest is the scenario's own."""
+    values = {each.key: value_of(DEFAULT, each) for each in MACHINE.values() if each.key in puller.missing}
+    return {key: value for key, value in values.items() if value is not None}
 
 
 def doubts(puller: PullerFile) -> list[str]:

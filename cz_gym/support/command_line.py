@@ -17,6 +17,8 @@ OPTIONAL = (
     "pygame", "pythonfmu", "sb3_contrib", "selenium", "stable_baselines3", "tensorboard", "torch", "torchrl", "tqdm",
 )  # fmt: skip
 """Modules of the packages in the extras of ``pyproject.toml``."""
+OWN_EXTRA = {"distributed": "cluster", "casadi": "mpc"}
+"""Extras of modules that an option of a command needs, and not the command."""
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -77,19 +79,29 @@ def guarded(prog: str, body: Callable[[], int], extra: str, left: str = "nothing
     """
     os.environ["MPLBACKEND"] = "agg"  # commands draw files; a notebook's backend may be missing here
     try:
-        return body()
+        code = body()
+        sys.stdout.flush()
+        return code
     except (CzError, DependencyNotInstalled) as error:
         message = str(error)
     except ModuleNotFoundError as error:
         module = (error.name or "").partition(".")[0]
         if module not in OPTIONAL:
             raise
-        message = f'{module} is missing: pip install ".[{extra}]"'
+        message = missing(module, extra)
+    except BrokenPipeError:  # the reader of a pipe has seen enough, as head has
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     except KeyboardInterrupt:
         print(f"{prog}: interrupted; {left}", file=sys.stderr)
         return 130
     print(f"{prog}: {' '.join(message.split())}", file=sys.stderr)
     return 2
+
+
+def missing(module: str, extra: str) -> str:
+    """Return the line on a package that is not installed; ``extra`` names the extras of the command."""
+    return f'{module} is missing: pip install ".[{OWN_EXTRA.get(module, extra)}]"'
 
 
 def shown(path: str | Path) -> str:

@@ -51,6 +51,7 @@ def test_everything_advertised_is_there():
         ({"parameters": {"sigma": 1.0}}, r"cz_gym\.Parameters"),
         ({"parameters": Parameters(k_l=math.nan)}, "parameter k_l = nan"),
         ({"meniscus": "hurle"}, r"cz_gym\.MeniscusModel"),
+        ({"process": "x"}, "this needs a Process, not 'x': cz_gym.body.process.BODY is one"),
         ({"scenaro": "hard"}, "unexpected keyword argument .scenaro.: did you mean .scenario.[?]"),
         ({"frameskip": 4}, "unexpected keyword argument .frameskip.; choose from scenario"),
         ({"action": "rough"}, "unknown action 'rough'; choose from direct, smooth, rate"),

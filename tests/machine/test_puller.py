@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import gymnasium as gym
@@ -248,3 +249,21 @@ def test_another_pullers_states_actions_and_parameters_are_refused():
         make_config(puller=Config())
     assert make_config().with_scenario("randomized").scenario == RANDOMIZED
     assert "silicon-300mm (" in str(env.config.made_for)
+
+
+def test_what_is_left_alone_grows_as_fast_as_the_plant_does():
+    """A small error on germanium, whose melt is small, by simulation with nominal drives."""
+    text = describe.implied(find_puller("germanium"))["left alone"]
+    said = [float(minutes) for minutes in re.findall(r"in ([\d.]+) min", text)]
+    assert describe.implied(DEFAULT)["left alone"].startswith("Model I dies out, Model II grows")
+    for model, minutes in zip("I II".split(), said, strict=True):
+        env = CzEnv("nominal", model=model, puller="germanium", action="direct", horizon=7200.0)
+        env.reset(seed=0)
+        errors = []
+        for _ in range(env.unwrapped.config.steps):
+            *_, over, cut, info = env.step(np.array([0.002, 0.0], np.float32) * (len(errors) < 60))
+            errors.append(abs(info["r_c"] - info["r_ref"]))
+            if over or cut:
+                break
+        late = np.log(errors[-1200:])
+        assert 60.0 / np.polyfit(np.arange(len(late)) / 60.0, late, 1)[0] / 60.0 == pytest.approx(minutes, rel=0.2)

@@ -72,6 +72,14 @@ def printed(code, place, cwd):
     return python("-W", "error", "-c", prelude + code, cwd=cwd).split()
 
 
+def test_a_clone_finds_its_packages_without_an_installation():
+    """As after ``pip install .``, whose package the clone's own folder hides."""
+    code = "import cz_gym.baselines, cz_gym.agents; print(cz_gym.baselines.__file__)"
+    assert printed(f"import sys; sys.path.insert(0, {str(ROOT)!r}); {code}", ROOT / "docs", ROOT) == [
+        str(ROOT / "baselines" / "__init__.py")
+    ]
+
+
 def test_every_package_is_listed():
     found = {
         ".".join(("cz_gym", *file.parent.relative_to(ROOT / (top if top == "cz_gym" else ".")).parts))

@@ -17,7 +17,7 @@ def test_the_cosine_is_that_of_the_usual_crystals():
 
 
 def test_the_ceiling_is_the_cosine_of_a_perfect_critic():
-    """Noise of each future three times as large as the slopes: reliability 8 / (8 + 9); without the tails a little less."""
+    """Noise of each future three times as large as the slopes: reliability 8 / (8 + 9); without tails a little less."""
     rng = np.random.default_rng(1)
     expected = rng.standard_normal((20_000, 2))
     futures = expected + 3.0 * rng.standard_normal((FUTURES, *expected.shape))

@@ -105,6 +105,15 @@ def test_a_word_after_cz_gym_is_a_command(words, code, said, capfd):
     assert "".join(capfd.readouterr()).startswith(said)
 
 
+def test_a_reader_that_has_seen_enough_ends_the_command_quietly():
+    """As of ``cz-gym puller default | head -1``."""
+    code = "import cz_gym_command, sys; sys.exit(cz_gym_command.main(['puller', 'default']))"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 141
+
+
 def test_help_comes_before_the_package_is_imported():
     loads = "import sys, cz_gym_command; cz_gym_command.main([]); assert not {'cz_gym', 'numpy'} & {*sys.modules}"
     for word in python("-c", loads).split("\n  ")[1:]:
@@ -116,6 +125,8 @@ def test_help_comes_before_the_package_is_imported():
     [
         (None, 0, ""),
         (ModuleNotFoundError("none", name="torch.nn"), 2, 'prog: torch is missing: pip install ".[agents]"\n'),
+        (ModuleNotFoundError("", name="distributed"), 2, 'prog: distributed is missing: pip install ".[cluster]"\n'),
+        (ModuleNotFoundError("none", name="casadi"), 2, 'prog: casadi is missing: pip install ".[mpc]"\n'),
         (CzError("first line\nsecond line"), 2, "prog: first line second line\n"),
         (DependencyNotInstalled("no pygame"), 2, "prog: no pygame\n"),
         (KeyboardInterrupt(), 130, "prog: interrupted; runs are complete\n"),

@@ -14,7 +14,19 @@ from cz_gym.support.units import KILO, MM, MM_PER_MIN, PERCENT
 
 from .canvas import INK, canvas, chosen, png, styles_of
 from .crystal import example, lost
-from .tables import FAILURES, HEATER_STEP, NOTHING, PULL_STEP, RETURN, RMSE, Column, Verdict, label
+from .tables import (
+    FAILURES,
+    HEATER_STEP,
+    NOTHING,
+    PULL_STEP,
+    RETURN,
+    RMSE,
+    Column,
+    Verdict,
+    deciding,
+    label,
+    too_few,
+)
 
 MOST = 6
 """Largest number of controllers in the picture."""
@@ -67,16 +79,20 @@ def verdict(results: Sequence[Result], column: Column = RMSE) -> Verdict:
     able = [sample.name for sample in results[0].samples if not sample.contender.bound]
     if not able:
         return Verdict("No controller that reads sensors took part in this run.")
+    if few := too_few(deciding(results)):
+        return Verdict(few)
     crown, body = grows(results, 0), grows(results, 1)
 
-    def place(name: str) -> tuple[float, float]:
-        lost_crystals = sum(result.means[name][FAILURES.metric].mean for result in results)
-        return lost_crystals, crown.means[name][RMSE.metric].mean
+    def losses(name: str) -> float:
+        return sum(result.means[name][FAILURES.metric].mean for result in results)
 
-    best = min(able, key=place)
-    lost_of = (f"{_plain(FAILURES, result, best)} % of {result.case.name}" for result in results)
+    fewest = [name for name in able if losses(name) == min(map(losses, able))]
+    best = min(fewest, key=lambda name: crown.means[name][RMSE.metric].mean)
+    lost_of = ", ".join(f"{_plain(FAILURES, result, best)} % of {result.case.name}" for result in results)
     crowns, bodies = _plain(CROWN_95, crown, best), _plain(BODY, body, best)
-    said = [f"{best} loses the fewest crystals, {', '.join(lost_of)}"]
+    who = f"{', '.join(fewest[:-1])} and {fewest[-1]} lose" if len(fewest) > 1 else f"{best} loses"
+    said = [f"{who} the fewest crystals, {lost_of}"]
+    said += [f"of them {best} has the least error in the crown"] if len(fewest) > 1 else []
     said += [f"95 % of its crowns are at most {crowns} mm off"] if crowns != NOTHING else []
     said += [f"{bodies} % of the body is within 0.5 mm"] if bodies != NOTHING else []
     return Verdict(f"{'; '.join(said)}.")

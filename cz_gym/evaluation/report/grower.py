@@ -13,7 +13,19 @@ from cz_gym.evaluation.results import Result, Sample
 from cz_gym.evaluation.statistics import Estimate, Resamples, means
 from cz_gym.support.units import MM, PERCENT
 
-from .tables import DRIVES, FAILURES, FEWEST, HEATER_STEP, NOTHING, PULL_STEP, Column, crystals, deciding, label
+from .tables import (
+    DRIVES,
+    FAILURES,
+    FEWEST,
+    HEATER_STEP,
+    NOTHING,
+    PULL_STEP,
+    Column,
+    crystals,
+    deciding,
+    label,
+    too_few,
+)
 
 FORM = "cz_gym.baselines.analysis.linear_form:linear_form"
 LOOP = "cz_gym.baselines.analysis.frequency:loop_margins"
@@ -87,7 +99,7 @@ def recommendation(results: Sequence[Result]) -> str:
     """Who loses the fewest crystals and, of those, makes the least scrap; bounds and a few crystals do not count."""
     counted = deciding(results)
     able, number = [one for one in counted[0].samples if not one.contender.bound], len(counted[0].seeds)
-    if not able or 1 < number < FEWEST:
+    if not able or too_few(counted):
         return f"No recommendation: {crystals(number)}, and it takes a controller and at least {FEWEST}."
     best = min(able, key=lambda sample: _order(counted, sample))
     lost, share = _order(counted, best)

@@ -113,7 +113,7 @@ def _of_crystals(results: Sequence[Result]) -> list[str]:
         f"{INTERVALS} Errors are those of the true radius against the recipe's at the length grown; a crystal that is "
         f"lost in crown or tail has the largest allowed one there. What is said of the body is said of the length that "
         f"was grown. {_none_of(results)} docs/crystal.md explains every column.",
-        "Losses on each stage; crown, body and tail where the stage grows them; energy is that of the body.",
+        "Losses on each stage; crown, body and tail where the stage grows them; energy is the body's, if there is one.",
     ]
 
 

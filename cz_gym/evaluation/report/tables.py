@@ -155,7 +155,14 @@ def overview(results: Sequence[Result]) -> tuple[tuple[str, ...], dict[str, list
 
 def deciding(results: Sequence[Result]) -> list[Result]:
     """Return the results on random scenarios, which alone count for a verdict; all if there are none."""
-    return [result for result in results if len(result.seeds) > 1] or list(results)
+    return [result for result in results if not result.case.deterministic] or list(results)
+
+
+def too_few(results: Sequence[Result]) -> str:
+    """Return that random crystals are too few to say who is better; nothing if they are not."""
+    number = len(results[0].seeds)
+    few = number < FEWEST and not results[0].case.deterministic
+    return f"No verdict: {crystals(number)}, and a verdict needs at least {FEWEST}." if few else ""
 
 
 def best_of_each_kind(results: Sequence[Result]) -> list[Sample]:
@@ -192,8 +199,8 @@ def verdict(results: Sequence[Result], column: Column = RMSE) -> Verdict:
         return Verdict("No learned agent took part in this run.")
     if results[0].rival is None:
         return Verdict("No classical controller took part in this run to compare the agents with.")
-    if 1 < (number := len(results[0].seeds)) < FEWEST:
-        return Verdict(f"No verdict: {number} crystals, and a verdict needs at least {FEWEST}.")
+    if few := too_few(results):
+        return Verdict(few)
     heads = ["scenario", "best classical [mm]"]
     for group in groups:
         heads += [f"best {group} [mm]", "difference [mm]"]

@@ -61,8 +61,16 @@ def _export(given: argparse.Namespace) -> None:
     else:
         files = WRITERS[given.to](block.program, given.real == "float") | {"vector.csv": test_vector(block)}
         files["README.md"] = readme(block, list(files), given.real == "float")
+        _check_own(given.out, block.program.name)
     write_files({given.out / name: text.encode() if isinstance(text, str) else text for name, text in files.items()})
     print(*(shown(given.out / name) for name in files), sep="\n")
+
+
+def _check_own(folder: Path, name: str) -> None:
+    """Raise CzError for a folder with the README of another block: its test vector would be taken for this one's."""
+    path = folder / "README.md"
+    if path.exists() and not path.read_text("utf-8").startswith(f"# {name}:"):
+        raise CzError(f"{path} is of another block: name another folder")
 
 
 def readme(block: Block, files: list[str], single: bool) -> str:

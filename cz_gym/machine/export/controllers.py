@@ -45,8 +45,8 @@ def make_block(name: str, config: Config) -> Block:
         if config.puller != DEFAULT:
             tuned = "Settings scaled to the puller, or searched for it beside its file"
         controller = entry.make(config)
-        if not (hasattr(controller, "at_rest") and hasattr(controller, "step")):
-            raise CzError(f"{name} cannot be exported: it solves an optimisation problem, or has no feedback")
+        if not getattr(controller, "exportable", False):
+            raise CzError(f"{name} cannot be exported: it has no feedback, several filters or an optimisation")
         facts = f"Controller {name}: {entry.meaning}.", f"{tuned}.", plant, fallback
         return Block(identifier, controller, pid, config, facts)
     contract = (policy := agents.load(name)).contract

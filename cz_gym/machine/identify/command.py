@@ -41,11 +41,14 @@ def _main(given: argparse.Namespace) -> int:
     for option, path, suffix in (("--out", given.out, ".toml"), ("--series", given.series, ".csv")):
         if path is not None and path.suffix != suffix:
             raise CzError(f"{option} must be a file NAME{suffix}, not {path}")
+        if path is not None:
+            check_writable(path.absolute().parent)
     start = find_puller(given.puller)
+    if start.file is not None and given.out.exists() and given.out.samefile(start.file):
+        raise CzError(f"--out {given.out} is the file to start from: name another one")
     logs = [read_log(path, column_map(given.column, given.columns)) for path in given.log]
     for path, log in zip(given.log, logs, strict=True):
         check_puller(log, start, str(path))
-    check_writable(given.out.parent)
     identified = identify(logs, start, dict(map(_prior, given.prior)))
     page, files = given.out.with_suffix(".md"), dict[Path, bytes]()
     if given.force or not identified.misfits:

@@ -85,6 +85,8 @@ async def serving(arguments: argparse.Namespace, door: Any) -> AsyncIterator[tup
     from .opcua import Tags, certify, pump
     from .page import Page
 
+    if arguments.log_size and not arguments.log:
+        raise CzError("--log-size divides the file of --log, which is not named")
     if door.remote:
         await certify(arguments.certificates)
     log = LogFile(arguments.log, 1e6 * (arguments.log_size or math.inf)) if arguments.log else None

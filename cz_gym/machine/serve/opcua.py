@@ -19,6 +19,7 @@ from asyncua.server.user_managers import UserManager
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from cz_gym.errors import CzError
+from cz_gym.support.atomic_files import check_writable, naming
 
 from .machine import TAGS, Clock, Machine, Tag
 
@@ -225,7 +226,9 @@ async def certify(folder: Path) -> None:
         return
     mask = os.umask(0o077)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        with naming(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        check_writable(folder)
         use, der = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH], folder / "certificate.der"
         await setup_self_signed_certificate(key, der, URI, gethostname(), use, {"commonName": "Cz-v0 virtual puller"})
         certificate.write_text(ssl.DER_cert_to_PEM_cert(der.read_bytes()))

@@ -18,6 +18,7 @@ from cz_gym.commands import tune
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
+from cz_gym.errors import CzError
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.machine.puller import FOLDER
 from tests.observed import PLAIN
@@ -125,6 +126,22 @@ def test_a_search_keeps_the_control_interval_and_puller_of_its_environment(tuned
     search.add(search.first)
     assert len(met) == 1 + len(search.goal.survive)
     assert set(met) == {(config.made_for, config.made_for)}
+
+
+def test_a_search_is_not_continued_on_other_crystals_or_at_another_interval(tmp_path, monkeypatch):
+    goal, path = PIDS[0].goal(RANDOMIZED), tmp_path / "search.json"
+
+    def search(scenario, dt):
+        config = make_config(scenario, control_interval=dt, **PLAIN)
+        return Search(PIDS[0].name, goal, config, 2, 10, lambda *_: FIGURES)
+
+    search("randomized", 2.0).tune(path)
+    tried = path.read_bytes()
+    search("randomized", 2.0).tune(path)
+    for scenario, dt in (("randomized", 5.0), ("hard", 2.0)):
+        with pytest.raises(CzError, match="begun on other crystals or at another control interval"):
+            search(scenario, dt).tune(path)
+    assert path.read_bytes() == tried
 
 
 # PIDs

@@ -11,7 +11,7 @@ from cz_gym.baselines.registry import find_controller
 from cz_gym.body.plant import make_puller
 from cz_gym.commands import benchmark
 from cz_gym.evaluation.protocol import find_case
-from cz_gym.evaluation.report import grower
+from cz_gym.evaluation.report import grower, tables
 from cz_gym.evaluation.report.markdown import markdown, terminal
 from cz_gym.evaluation.report.page import page
 from cz_gym.evaluation.results import Sample, summarise
@@ -52,7 +52,7 @@ def test_scrap_is_the_share_of_time_outside_the_band_and_all_of_it_after_a_loss(
 def test_the_first_line_recommends_the_controller_that_loses_least_and_scraps_least(result, monkeypatch):
     texts = markdown([result], "", ()), page([result], ""), terminal([result])
     assert texts[0].startswith("No recommendation: 4 crystals, and it takes a controller and at least 20.")
-    monkeypatch.setattr(grower, "FEWEST", 4)
+    monkeypatch.setattr(tables, "FEWEST", 4)
     line = grower.recommendation([result])
     best = grower.outcome(result)[1][0][0]
     assert line.startswith(f"Recommended for silicon-300mm: {best}, which loses none of 4 crystals on randomized. The ")

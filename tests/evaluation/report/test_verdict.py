@@ -5,8 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.evaluation.protocol import Case
-from cz_gym.evaluation.report import tables
+from cz_gym.evaluation.report import crystals, tables
 from cz_gym.evaluation.report.tables import FEWEST, best_of_each_kind, verdict
 from cz_gym.evaluation.results import Result, Sample
 from cz_gym.evaluation.statistics import Estimate
@@ -16,7 +17,7 @@ BETTER, WORSE, EITHER = Estimate(-1.0, (-2.0, -0.5), 9), Estimate(1.0, (0.5, 2.0
 
 
 def made(**scenarios):
-    """Results of agents a, b, ...; each scenario gives their differences, "single" stands for one crystal.
+    """Results of agents a, b, ...; each scenario gives their differences, "single" a scenario of one crystal.
 
     The rival has an RMSE of 5 mm; b knew the plant in training.
     """
@@ -30,7 +31,8 @@ def made(**scenarios):
         samples = tuple(Sample(each, seeds, np.zeros((1, 1, 1)), 0.0) for each in who)
         means = {"lqg": {"rmse_mm": Estimate(5.0, (4.0, 6.0), 9)}}
         means |= {agent: {"rmse_mm": Estimate(5.0 + each.mean, None, 9)} for agent, each in verdicts.items()}
-        results.append(Result(Case(name, "randomized", ""), samples, means, {}, {}, {}, {}, "lqg", verdicts))
+        case = Case(name, "nominal" if len(seeds) == 1 else "randomized", "")
+        results.append(Result(case, samples, means, {}, {}, {}, {}, "lqg", verdicts))
     return results
 
 
@@ -83,6 +85,25 @@ def test_there_is_no_verdict_on_a_few_crystals_or_of_one_kind_alone(monkeypatch)
     assert verdict([only]).sentence.startswith("No classical controller took part")
     monkeypatch.setattr(tables, "FEWEST", FEWEST + 1)
     assert verdict(made(one=[BETTER])) == ("No verdict: 20 crystals, and a verdict needs at least 21.", (), ())
+    one = replace(made(single=[BETTER])[0], case=Case("one", "randomized", ""))
+    assert verdict([one]).sentence.startswith("No verdict: 1 crystal, ")
+
+
+def test_controllers_that_lose_equally_few_crystals_are_named_together(monkeypatch):
+    case, names = Case("crown", "randomized", "", process=CRYSTAL, stage="crown"), ("a", "b", "c", "d")
+    samples = tuple(Sample(contender(name), tuple(range(FEWEST)), np.zeros((1, 1, 1)), 0.0) for name in names)
+    losses = zip(names, (0.1, 0.0, 0.0, 0.0), (1.0, 3.0, 2.0, 4.0), strict=True)
+    means = {
+        name: {"failure_rate": Estimate(lost, None, 9), "rmse_mm": Estimate(rmse, None, 9)}
+        for name, lost, rmse in losses
+    }
+    result = Result(case, samples, means, {}, {}, {}, {}, None, {})
+    monkeypatch.setattr(crystals, "_plain", lambda column, result, name: f"{name}'s")
+    assert crystals.verdict([result]).sentence.startswith(
+        "b, c and d lose the fewest crystals, c's % of crown; of them c has the least error in the crown; 95 % of its "
+    )
+    few = replace(result, samples=tuple(replace(each, seeds=each.seeds[:1]) for each in samples))
+    assert crystals.verdict([few]).sentence.startswith("No verdict: 1 crystal, ")
 
 
 def test_an_agent_stands_with_those_that_were_told_as_much_as_the_most_told_of_its_training_seeds():

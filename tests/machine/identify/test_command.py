@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from cz_gym.machine.identify import command
-from cz_gym.machine.puller import read_puller
+from cz_gym.machine.puller import find_puller, read_puller, write_puller
 from examples import identify as example
 from studies import identify as study
 from studies import other_machine
@@ -53,6 +53,8 @@ def test_the_example_goes_from_a_log_to_a_controller(logs, found, tmp_path, monk
     ("options", "said"),
     [
         (["--out", "my.txt"], "--out must be a file NAME.toml"),
+        (["--series", "my.txt"], "--series must be a file NAME.csv"),
+        (["--series", "/proc/none/my.csv"], "/proc/none"),
         (["--prior", "C_1"], "--prior C_1: write it as NAME=SD"),
         (["--prior", "C1=0.1"], "did you mean 'C_1'"),
         (["--column", "T_1_K=PYRO"], "unknown column 'PYRO'"),
@@ -67,6 +69,15 @@ def test_what_is_wrong_is_one_line_and_nothing_is_written(options, said, logs, t
     given = options if "--out" in options else [*options, "--out", str(tmp_path / "new" / "my.toml")]
     assert said in refused(command.main, [str(logs[0]), *given])
     assert not (tmp_path / "new").exists()
+
+
+def test_the_file_to_start_from_is_not_written_over(logs, tmp_path, refused):
+    start = tmp_path / "start.toml"
+    write_puller(find_puller("default"), start)
+    text = start.read_text()
+    words = [str(logs[0]), "--puller", str(start), "--out", str(tmp_path / "." / "start.toml")]
+    assert "is the file to start from" in refused(command.main, words)
+    assert start.read_text() == text
 
 
 @pytest.mark.slow

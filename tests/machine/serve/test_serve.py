@@ -311,3 +311,6 @@ def test_a_port_that_is_taken_and_half_a_certificate_are_said_in_one_line(puller
     (tmp_path / "key.pem").touch()
     options = ["--host", "0.0.0.0", "--operator", "olga", "--certificates", str(tmp_path)]
     assert "both certificate.pem and key.pem" in refused(command.main, options)
+    assert "Is a directory" not in refused(command.main, [*options[:-1], str(tmp_path / "certificate.pem")])
+    assert "/proc/none" in refused(command.main, [*options[:-1], "/proc/none"])
+    assert "--log-size divides" in refused(command.main, ["--log-size", "5"])
