@@ -14,7 +14,7 @@ from cz_gym.baselines.lqg.ring_model import RingModel
 from cz_gym.config import Config
 from cz_gym.episodes.mixture import Distribution
 from cz_gym.episodes.scenario import Scenario, Sensor
-from cz_gym.episodes.scenarios import RANDOMIZED, find_distribution
+from cz_gym.episodes.scenarios import PULLER, RANDOMIZED, find_distribution
 from cz_gym.errors import CzError
 from cz_gym.machine.puller import DEFAULT
 
@@ -160,8 +160,8 @@ class OneDesign(TunedLQG):
     """An LQG with one design for every scenario: like an agent it is not told which one it meets."""
 
     def design(self, scenario: Scenario) -> LQGDesign:
-        """The design, whatever the scenario; it has no model of a camera."""
-        return super().design(RANDOMIZED)
+        """The design, whatever the scenario; its camera may be as late as that of ``puller`` and ripple as much."""
+        return replace(super().design(RANDOMIZED), ring=ring_of(PULLER.sensor))
 
     def crystals(self, scenario: Scenario) -> Distribution:
         """The crystals that agents learn from."""

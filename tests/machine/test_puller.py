@@ -256,7 +256,7 @@ def test_what_is_left_alone_grows_as_fast_as_the_plant_does():
     text = describe.implied(find_puller("germanium"))["left alone"]
     said = [float(minutes) for minutes in re.findall(r"in ([\d.]+) min", text)]
     assert describe.implied(DEFAULT)["left alone"].startswith("Model I dies out, Model II grows")
-    for model, minutes in zip("I II".split(), said, strict=True):
+    for model, minutes in zip(("I", "II"), said, strict=True):
         env = CzEnv("nominal", model=model, puller="germanium", action="direct", horizon=7200.0)
         env.reset(seed=0)
         errors = []

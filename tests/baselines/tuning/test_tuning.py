@@ -269,20 +269,22 @@ def test_the_family_has_less_error_the_more_it_may_move(scenario):
 
 
 @pytest.mark.parametrize(
-    ("name", "kind", "trials", "scenario"),
+    ("name", "said", "trials", "scenario"),
     [
-        ("paper-filtered", "FilteredPID(", 3, "randomized"),
-        ("lqg-at-0.02", "LQGDesign(", 13, "0.5 hot-zone + 0.5 randomized"),
+        ("paper-filtered", "T_f = ", 3, "randomized"),
+        ("lqg-at-0.02", "weights.pull = ", 13, "0.5 hot-zone + 0.5 randomized"),
     ],
 )
-def test_the_command_writes_what_the_search_chose(name, kind, trials, scenario, monkeypatch, tmp_path, capsys):
+def test_the_command_writes_what_the_search_chose(name, said, trials, scenario, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(tune, "measure", lambda policy, config, seeds: FIGURES)
     arguments = ["--controller", name, "--trials", f"{trials}", "--control-interval", "2", "--out", str(tmp_path)]
     assert tune.main(arguments) == 0
     written = json.loads((tmp_path / f"{name}.json").read_text())
     assert len(written["history"]) == trials
     assert written["scenario"] == scenario
-    assert kind in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert said in out
+    assert f"wrote {tmp_path / name}.json" in out
 
 
 @pytest.mark.parametrize(
