@@ -205,6 +205,7 @@ LQGS = (
         meaning="lqg with one design for every scenario: like agents it is not told which one it meets",
         limits={"randomized": (0.3, 0.02)},
         by_return=True,
+        quoted=True,
         on_puller=False,
         searched_on_puller=False,
     ),

@@ -17,7 +17,7 @@ OBSERVABLE = ("sensor-fault", "puller")
 """Scenarios whose true radius error holds an offset of the ring, which no sensor shows."""
 STEP = "pull_step_rms_mm_per_min"
 PIDS = ("paper", "paper-filtered", "paper-tuned", "pid-conventional", "industrial")
-LQGS = ("lqg", "lqg-quiet", "lqg-at-0.02", "lqg-at-0.02-adaptive")
+LQGS = ("lqg", "lqg-quiet", "lqg-at-0.02", "lqg-at-0.02-adaptive", "lqg-one-design")
 CRYSTALS = ("ring-pid-reduced", "compensated", "lqg-along", "true-radius")
 PULLERS = ("silicon-300mm", "germanium")
 BOUNDS = ("lqg", "lqg-quiet", "lqg-true", "full-information", "clairvoyant")

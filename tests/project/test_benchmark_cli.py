@@ -323,7 +323,7 @@ def test_one_s_own_controller_runs_beside_a_few_into_its_own_folder(tmp_path, mo
     assert benchmark.main(command) == 0
     assert capsys.readouterr().out.endswith("\nwrote runs/Still; open runs/Still/report.html\n")
     results = json.loads(Path("runs/Still/benchmark.json").read_text())["results"]["reference-b"]
-    assert list(results) == ["paper", "paper-tuned", "lqg-at-0.02", "Still"]
+    assert list(results) == ["paper", "paper-tuned", "lqg-at-0.02", "lqg-one-design", "Still"]
     assert "runs/Still/benchmark.json exists: add --overwrite" in refusal(command)
     monkeypatch.setattr(benchmark, "benchmark", lambda arguments, command: folders.append(arguments.out) or 0)
     folders = []

@@ -23,7 +23,7 @@ MARKERS = {
 }  # fmt: skip
 """Matplotlib's markers with plotly's names for them."""
 DPI = 160
-COLUMNS = 5
+COLUMNS = 6
 """Largest number of controllers in the figure of a crystal and the short table: more would be too wide for a page."""
 INK, GREY = "#222222", "#999999"
 

@@ -28,7 +28,7 @@ from .tables import (
 )
 from .tables import markdown as table
 
-ROWS = 7
+ROWS = 8
 """Number of controllers in a page's short table."""
 MARKERS = "<!-- {}:begin -->", "<!-- {}:end -->"
 """Markers around the part of a page that :func:`fill_in` writes."""

@@ -49,7 +49,7 @@ def test_many_controllers_are_chosen_by_a_rule():
 
 
 def test_figure_and_short_table_show_who_is_quoted_the_best_agents_and_one_s_own():
-    usual = ["paper", "paper-tuned", "lqg-at-0.02", "gradient", "ppo"]
+    usual = ["paper", "paper-tuned", "lqg-at-0.02", "lqg-one-design", "gradient", "ppo"]
     assert names(chosen(everyone(), COLUMNS)) == usual
     mine = [*everyone(), sample("mine", 50.0, own=True)]
     assert {"paper", "mine", "gradient"} < set(names(chosen(mine, COLUMNS)))
