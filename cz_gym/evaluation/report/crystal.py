@@ -57,7 +57,7 @@ class DrawnCrystal(NamedTuple):
 
 def draw(crystals: Sequence[DrawnCrystal], dt: float, title: str, tolerance: float = 0.0) -> Figure:
     """Draw a crystal under some controllers, at steps of ``dt`` [s], with a band of the tolerance [m] in grey."""
-    figure = canvas(max(1.62 * len(crystals) + 1.0, 5.0), 7.6)
+    figure = canvas(1.0 + min(max(1.62 * len(crystals), 4.0), 8.1), 7.6)
     axes = figure.subplots(len(_PANELS), len(crystals), sharex=True, sharey="row", squeeze=False)
     longest = max((crystal.signals for crystal in crystals), key=lambda signals: len(signals.r_c))
     for place, crystal in enumerate(crystals):
