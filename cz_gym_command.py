@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 from importlib import import_module
+from importlib.metadata import version
 
 COMMANDS = {
     "train": ("cz_gym.commands.train", "train an agent by a recipe"),
@@ -33,6 +34,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     word, *others = [*(sys.argv[1:] if arguments is None else arguments), "--help"]
     if word in ("-h", "--help"):
         print(HELP)
+        return 0
+    if word == "--version":
+        print(f"cz-gym {version('cz-gym')}")
         return 0
     if word not in COMMANDS:
         close = get_close_matches(word, COMMANDS, 1)

@@ -104,9 +104,9 @@ def _main(given: argparse.Namespace) -> None:
         "T_1 K": rows.T_1_K, "superheat K": rows.superheat_K, "meniscus mm": rows.meniscus_height_mm,
         "mass kg": rows.crystal_mass_kg,
     }  # fmt: skip
+    files = {given.out / "recipe.csv": to_csv(rows).encode(), given.out / "recipe.png": draw(rows, puller.label)}
+    write_files(files)
     print(" ".join(f"{heading:>11}" for heading in headed))
     for i in every:
         print(" ".join(f"{column[i]:>11.4g}" for column in headed.values()))
-    files = {given.out / "recipe.csv": to_csv(rows).encode(), given.out / "recipe.png": draw(rows, puller.label)}
-    write_files(files)
     print("wrote", ", ".join(shown(path) for path in files))

@@ -12,7 +12,7 @@ import pytest
 from gymnasium.error import DependencyNotInstalled
 
 import cz_gym_command
-from cz_gym import datasets
+from cz_gym import __version__, datasets
 from cz_gym.commands import benchmark, play, tune
 from cz_gym.errors import CzError
 from cz_gym.support.command_line import OPTIONAL, guarded
@@ -96,6 +96,7 @@ def test_an_interrupt_while_a_command_is_imported_is_one_line(command, tmp_path)
     [
         (["--help"], 0, "usage: cz-gym COMMAND"),
         ([], 0, "usage: cz-gym COMMAND"),
+        (["--version"], 0, f"cz-gym {__version__}\n"),
         (["trian"], 2, "cz-gym: unknown command 'trian': did you mean 'train'? Choose from train, benchmark, tune"),
         (["tune"], 2, "cz-gym tune: name a --controller, or a --puller to design for"),
     ],

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from cz_gym.episodes.log_series import to_csv
@@ -52,7 +53,7 @@ def _main(given: argparse.Namespace) -> int:
     identified = identify(logs, start, dict(map(_prior, given.prior)))
     page, files = given.out.with_suffix(".md"), dict[Path, bytes]()
     if given.force or not identified.misfits:
-        files[given.out] = to_toml(identified.puller).encode()
+        files[given.out] = to_toml(replace(identified.puller, name=given.out.stem)).encode()
         files |= {given.series: to_csv(identified.series()).encode()} if given.series else {}
     print(identified.verdict)
     write_files(report(identified, logs, ", ".join(path.name for path in given.log), page) | files)

@@ -18,7 +18,7 @@ def test_the_command_writes_the_puller_and_its_report(logs, found, tmp_path, mon
     assert command.main([str(logs[0]), "--out", str(out)]) == 0
     files = {file.name for file in out.parent.iterdir()}
     assert files == {"my-numbers.png", "my-readings.png", "my.md", "my.toml"}
-    assert read_puller(out).hash == found.puller.hash
+    assert (read_puller(out).hash, read_puller(out).name) == (found.puller.hash, "my")
     text = out.with_suffix(".md").read_text()
     assert text.count("| told |") == sum(e.informed for e in (*found.estimates, *found.noise))
     assert "says nothing about it" in text
