@@ -260,9 +260,12 @@ def best_corrections(H: Floats, g: Floats, prediction: Prediction, blocks: tuple
 
 
 def casadi() -> Any:
-    """The module casadi, of the extra mpc; commands name the extra if it is missing."""
-    import casadi
-
+    """The module casadi; ModuleNotFoundError in one line names the extra that contains it."""
+    try:
+        import casadi
+    except ModuleNotFoundError as error:
+        said = "this needs the package casadi: pip install '.[mpc]'"
+        raise ModuleNotFoundError(said, name=error.name) from None
     return casadi
 
 

@@ -545,11 +545,12 @@ def test_the_command_writes_a_folder(name, to, files, tmp_path):
     assert config_of("puller").plant_hash in text
 
 
-def test_a_folder_holds_one_block(tmp_path, refused):
+def test_a_folder_holds_one_block(tmp_path, refused, capsys):
     """Its test vector would be checked against another block."""
     for name, to in (("paper", "c"), ("paper", "st")):
         assert main([name, "--to", to, "--out", str(tmp_path)]) == 0
     files = {file: file.read_bytes() for file in tmp_path.iterdir()}
+    capsys.readouterr()
     assert "is of another block" in refused(main, ["paper-tuned", "--to", "c", "--out", str(tmp_path)])
     assert {file: file.read_bytes() for file in tmp_path.iterdir()} == files
 
