@@ -5,7 +5,10 @@ Importing this package registers ``Cz-v0`` and ``CzCrystal-v0``; ``gym.make("cz_
 
 import sys
 from importlib import import_module
+from importlib.machinery import ModuleSpec
+from importlib.util import spec_from_file_location
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 try:
@@ -27,9 +30,17 @@ from .env import CzEnv, EnvState
 from .observation import decode
 from .vector import CzVectorEnv
 
-_here = Path(__file__).parent
-if not (_here / "baselines").exists():  # in a clone, whose folders agents and baselines stand beside this one
-    __path__ += [str(_here.parent)]
+
+def _beside(name: str, *_: object) -> ModuleSpec | None:
+    """Find ``cz_gym.agents`` and ``cz_gym.baselines`` in a clone, where they stand beside this folder."""
+    package, own = name.partition(".")[::2]
+    place = Path(__file__).parents[1] / own
+    if package != __name__ or own not in ("agents", "baselines") or not place.is_dir():
+        return None
+    return spec_from_file_location(name, place / "__init__.py", submodule_search_locations=[str(place)])
+
+
+sys.meta_path.append(SimpleNamespace(find_spec=_beside))
 
 __version__ = "0.2.0"
 ENV_ID = "Cz-v0"

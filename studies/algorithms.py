@@ -19,7 +19,7 @@ from cz_gym.support.atomic_files import check_writable, write_files
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.units import MINUTE
 
-from .leaderboard import random_rows
+from .leaderboard import random_cases
 
 ABOUT = """RMSE of the radius on {crystals} validation crystals of each scenario that did not choose a run's agent; of
 each run the agent of least cost on the validation that selects. In brackets: 95 % intervals, bootstrap over training
@@ -75,7 +75,7 @@ def _compare(given: argparse.Namespace) -> None:
         policies.setdefault(name, []).append(policy)
         runs.setdefault(name, {})[seed] = read_rows(folder / "progress.csv")
     agents = [agent(name, trained) for name, trained in policies.items()]
-    results = run(agents, random_rows(JUDGING[0]), len(JUDGING), given.out)
+    results = run(agents, random_cases(JUDGING[0]), len(JUDGING), given.out)
     write_files({given.out / name: content for name, content in report(results, runs).items()})
     print(f"wrote {given.out / 'table.md'}")
 

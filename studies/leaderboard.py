@@ -40,8 +40,8 @@ Claims = Mapping[str, tuple[float, str]]
 """RMSE [mm] on the first case, and the contract, that each submission claims."""
 
 
-def random_rows(first_seed: int) -> list[Case]:
-    """The benchmark's rows of several crystals, from this seed on."""
+def random_cases(first_seed: int) -> list[Case]:
+    """The benchmark's cases of several crystals, from this seed on."""
     random = (case for case in CASES if case.default and not find_scenario(case.scenario).deterministic)
     return [replace(case, first_seed=first_seed) for case in random]
 
@@ -110,7 +110,7 @@ def _main(given: argparse.Namespace) -> None:
     if not submitted:
         raise CzError(f"{given.folder}: no submissions: each is a folder with agent files and benchmark.json")
     first = given.first_seed or FRESH[secrets.randbelow(len(FRESH) - len(TEST_SEEDS))]
-    rows = random_rows(first)
+    rows = random_cases(first)
     agents = [contender for contender, _ in submitted]
     check_agents(agents, rows)
     contenders = [*(each for each in CONTROLLERS if each.quoted), *agents]

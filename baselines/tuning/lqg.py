@@ -29,8 +29,9 @@ it the loop is unstable on some hot zones, and its own oscillation then speaks f
 ACTIVITIES = 0.005, 0.008, 0.013, 0.02, 0.03
 """Largest pull step RMS [mm/min] that the members of the family are tuned for."""
 IN_TABLE = 0.02
-"""Pull step RMS [mm/min] of the family's member that runs by default, of less radius error than any that moves less. On
-a puller of the user's own its filter alone is searched, and the other LQGs have the same one with their own weights."""
+"""Pull step RMS [mm/min] of the family's member that runs by default: on ``randomized`` the one of least radius error
+that moves less than ``paper-tuned``. On a puller of the user's own its filter alone is searched, and the other LQGs
+have the same one with their own weights."""
 PARAMETERS = tuple(Parameter(path, 1e-4, 1e4) for path in by_scenario("lqg")[RANDOMIZED.name])
 ON_PULLER = tuple(
     Parameter(path, 0.0, 0.0)
@@ -162,6 +163,11 @@ class OneDesign(TunedLQG):
     def design(self, scenario: Scenario) -> LQGDesign:
         """The design, whatever the scenario; its camera may be as late as that of ``puller`` and ripple as much."""
         return replace(super().design(RANDOMIZED), ring=ring_of(PULLER.sensor))
+
+    def make(self, config: Config) -> LQG:
+        """The LQG for an environment, of several scenarios too."""
+        one = config if config.puller != DEFAULT else config.with_scenario(RANDOMIZED)
+        return super().make(one).for_config(config)
 
     def crystals(self, scenario: Scenario) -> Distribution:
         """The crystals that agents learn from."""

@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--scenario", help=f"scenario to tune on ({RANDOMIZED.name})")
     add("--control-interval", type=float, help="time between actions [s] (5)")
     parser.add_cluster()
-    parser.add_puller("design for it: a controller of its own for each row, minutes of work")
+    parser.add_puller("search every controller that is designed for it, minutes of work")
     about = "candidates to try, those of an earlier run included (100; with --puller at most 10 to 48)"
     add("--trials", type=between(1, 100_000), help=about)
     add("--episodes", type=between(5, 5000), help="episodes a candidate (100; with --puller 20, whole crystals 60)")
@@ -102,7 +102,7 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
     searched = [known[given.controller]] if given.controller else alike
     crystals = isinstance(searched[0], TunedCrystal)
     beside = folder_of(puller).absolute()
-    if puller.file and puller.file.parent == FOLDER:
+    if puller.file and puller.file.resolve().parent == FOLDER.resolve():
         raise CzError(f"{puller.name} ships with what was designed for it: to search anew, copy {puller.file}")
     folder = (given.out or beside).absolute()
     tasks: list[Task] = []

@@ -73,9 +73,9 @@ def between(least: int, most: int) -> Callable[[str], int]:
 def guarded(prog: str, body: Callable[[], int], extra: str, left: str = "nothing written") -> int:
     """Run a command's body and return its exit code.
 
-    One line on stderr tells of a :class:`CzError`, a missing package of the project's extras, and Ctrl-C; every other
-    exception is a bug, the user's or ours, and keeps its traceback. ``extra`` names the extras of what the command
-    imports, ``left`` says what an interrupt leaves behind.
+    One line on stderr tells of a :class:`CzError`, a missing package of the project's extras, and Ctrl-C; a closed pipe
+    of stdout ends the command quietly; every other exception is a bug, the user's or ours, and keeps its traceback.
+    ``extra`` names the extras of what the command imports, ``left`` says what an interrupt leaves behind.
     """
     os.environ["MPLBACKEND"] = "agg"  # commands draw files; a notebook's backend may be missing here
     try:
@@ -89,9 +89,13 @@ def guarded(prog: str, body: Callable[[], int], extra: str, left: str = "nothing
         if module not in OPTIONAL:
             raise
         message = missing(module, extra)
-    except BrokenPipeError:  # the reader of a pipe has seen enough, as head has
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
+    except BrokenPipeError:
+        try:
+            print(flush=True)  # fails again if it was stdout's pipe, whose reader has seen enough, as head has
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 141
+        raise
     except KeyboardInterrupt:
         print(f"{prog}: interrupted; {left}", file=sys.stderr)
         return 130

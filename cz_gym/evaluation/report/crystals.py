@@ -84,15 +84,15 @@ def verdict(results: Sequence[Result], column: Column = RMSE) -> Verdict:
     crown, body = grows(results, 0), grows(results, 1)
 
     def losses(name: str) -> float:
-        return sum(result.means[name][FAILURES.metric].mean for result in results)
+        return round(sum(result.means[name][FAILURES.metric].mean for result in results), 9)
 
     fewest = [name for name in able if losses(name) == min(map(losses, able))]
     best = min(fewest, key=lambda name: crown.means[name][RMSE.metric].mean)
     lost_of = ", ".join(f"{_plain(FAILURES, result, best)} % of {result.case.name}" for result in results)
     crowns, bodies = _plain(CROWN_95, crown, best), _plain(BODY, body, best)
     who = f"{', '.join(fewest[:-1])} and {fewest[-1]} lose" if len(fewest) > 1 else f"{best} loses"
-    said = [f"{who} the fewest crystals, {lost_of}"]
-    said += [f"of them {best} has the least error in the crown"] if len(fewest) > 1 else []
+    said = [f"{who} the fewest crystals" + (f", {lost_of}" if len(fewest) == 1 else "")]
+    said += [f"of them {best}, which loses {lost_of}, has the least error in the crown"] if len(fewest) > 1 else []
     said += [f"95 % of its crowns are at most {crowns} mm off"] if crowns != NOTHING else []
     said += [f"{bodies} % of the body is within 0.5 mm"] if bodies != NOTHING else []
     return Verdict(f"{'; '.join(said)}.")

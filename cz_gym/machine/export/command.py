@@ -17,6 +17,7 @@ from .compiled import memory_of
 from .controllers import make_block
 from .onnx_graph import write_onnx
 from .ports import Alarm, meanings
+from .program import Program
 from .shell import Block
 from .text import fill_template, write_c, write_st
 from .vector import shadow, test_vector
@@ -61,15 +62,19 @@ def _export(given: argparse.Namespace) -> None:
     else:
         files = WRITERS[given.to](block.program, given.real == "float") | {"vector.csv": test_vector(block)}
         files["README.md"] = readme(block, list(files), given.real == "float")
-        _check_own(given.out, block.program.name)
+        _check_own(given.out, block.program)
     write_files({given.out / name: text.encode() if isinstance(text, str) else text for name, text in files.items()})
     print(*(shown(given.out / name) for name in files), sep="\n")
 
 
-def _check_own(folder: Path, name: str) -> None:
-    """Raise CzError for a folder with the README of another block: its test vector would be taken for this one's."""
+def _check_own(folder: Path, program: Program) -> None:
+    """Raise CzError for a folder with the README of another block, or of the same on another puller: its test vector
+    would be taken for this one's.
+    """
     path = folder / "README.md"
-    if path.exists() and not path.read_text("utf-8").startswith(f"# {name}:"):
+    text = path.read_text("utf-8", "replace") if path.exists() else ""
+    own = text.startswith(f"# {program.name}:") and "  \n".join(program.notes) in text
+    if text and not own:
         raise CzError(f"{path} is of another block: name another folder")
 
 

@@ -30,7 +30,7 @@ def test_an_lqg_tuned_on_nominal_hot_zones_loses_crystals_of_others_unless_it_kn
 
 def test_one_design_serves_every_scenario_and_loses_no_crystal():
     """The design is the same whatever scenario it is asked for."""
-    configs = [make_config(name, **PLAIN) for name in ("randomized", "puller", "hot-zone")]
+    configs = [make_config(name, **PLAIN) for name in ("randomized", "puller", "hot-zone", "all")]
     policies = [make_controller("lqg-one-design", config) for config in configs]
     assert len({policy.design for policy in policies}) == 1
     assert make_controller("lqg", configs[0]).design != make_controller("lqg", configs[1]).design

@@ -1,6 +1,7 @@
 """Controllers for another puller: the paper's procedure, proportions, what a search keeps, and the commands."""
 
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +26,7 @@ from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.machine.puller import find_puller, write_puller
+from cz_gym.machine.puller import FOLDER, find_puller, write_puller
 from cz_gym.support.units import HOUR
 from tests.observed import PLAIN
 
@@ -126,6 +127,7 @@ def test_one_command_designs_and_another_runs_it(tmp_path, monkeypatch, capsys):
     assert "leave both options out" in capsys.readouterr().err
     assert tune.main(["--puller", str(place), "--trials", "10", "--controller", "industrial", "--out", str(out)]) == 0
     assert f"wrote {out}: moved to {tmp_path / 'mine'}, cz-gym benchmark" in capsys.readouterr().out
+    assert tune.main(["--puller", os.path.relpath(FOLDER / "germanium.toml")]) == 2
     assert tune.main(["--puller", "germanium"]) == 2
     assert "germanium ships with what was designed for it: to search anew, copy" in capsys.readouterr().err
 

@@ -100,7 +100,7 @@ def test_controllers_that_lose_equally_few_crystals_are_named_together(monkeypat
     result = Result(case, samples, means, {}, {}, {}, {}, None, {})
     monkeypatch.setattr(crystals, "_plain", lambda column, result, name: f"{name}'s")
     assert crystals.verdict([result]).sentence.startswith(
-        "b, c and d lose the fewest crystals, c's % of crown; of them c has the least error in the crown; 95 % of its "
+        "b, c and d lose the fewest crystals; of them c, which loses c's % of crown, has the least error in the crown; "
     )
     few = replace(result, samples=tuple(replace(each, seeds=each.seeds[:1]) for each in samples))
     assert crystals.verdict([few]).sentence.startswith("No verdict: 1 crystal, ")

@@ -551,7 +551,8 @@ def test_a_folder_holds_one_block(tmp_path, refused, capsys):
         assert main([name, "--to", to, "--out", str(tmp_path)]) == 0
     files = {file: file.read_bytes() for file in tmp_path.iterdir()}
     capsys.readouterr()
-    assert "is of another block" in refused(main, ["paper-tuned", "--to", "c", "--out", str(tmp_path)])
+    for other in (["paper-tuned", "--to", "c"], ["paper", "--to", "st", "--puller", "germanium"]):
+        assert "is of another block" in refused(main, [*other, "--out", str(tmp_path)])
     assert {file: file.read_bytes() for file in tmp_path.iterdir()} == files
 
 
