@@ -98,7 +98,7 @@ class EkfMpc(LQG):
 
     @property
     def exportable(self) -> bool:
-        """It solves an optimisation problem in each step."""
+        """False: it solves an optimisation problem in each step."""
         return False
 
     @property

@@ -157,9 +157,8 @@ LEARNERS = {"behaviour cloning": clone, "TD3+BC": td3_bc}
 def score(policy: Any, dataset: Any) -> tuple[float, float]:
     """Normalised score, and share of crystals lost [%]."""
     figures = metrics(rollout(policy, make_config("randomized"), CRYSTALS))
-    return 100.0 * float(
-        minari.get_normalized_score(dataset, figures.return_).mean()
-    ), 100.0 * figures.failure_rate.mean()
+    normalised = float(minari.get_normalized_score(dataset, figures.return_).mean())
+    return 100.0 * normalised, 100.0 * figures.failure_rate.mean()
 
 
 def compare(name: str, seeds: int) -> list[tuple[str, ...]]:

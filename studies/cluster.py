@@ -41,7 +41,7 @@ def timed(address: str, function: Callable[[Any], Any], tasks: Sequence[Any]) ->
 def tasks_of(crystals: int, cache: Path) -> list[Task]:
     """Every controller on every scenario."""
     pairs = product(map(find_controller, CONTROLLERS), map(find_case, SCENARIOS))
-    return [Task(contender, row, crystals, cache) for contender, row in pairs]
+    return [Task(contender, case, crystals, cache) for contender, case in pairs]
 
 
 def _warm(tasks: Sequence[Task]) -> None:

@@ -14,7 +14,6 @@ from pathlib import Path
 
 from cz_gym.agents import OnnxPolicy
 from cz_gym.baselines.registry import CONTROLLERS
-from cz_gym.episodes.scenarios import find_scenario
 from cz_gym.errors import CzError
 from cz_gym.evaluation.contender import GROUPS, PLANT, REWARD, STATE, Contender, agent
 from cz_gym.evaluation.files import read_results, to_json
@@ -42,7 +41,7 @@ Claims = Mapping[str, tuple[float, str]]
 
 def random_cases(first_seed: int) -> list[Case]:
     """The benchmark's cases of several crystals, from this seed on."""
-    random = (case for case in CASES if case.default and not find_scenario(case.scenario).deterministic)
+    random = (case for case in CASES if case.default and not case.deterministic)
     return [replace(case, first_seed=first_seed) for case in random]
 
 
@@ -65,7 +64,7 @@ def submission(folder: Path) -> tuple[Contender, tuple[float, str]]:
     return contender, (results[CASES[0].name][folder.name]["rmse_mm"].mean, contract)
 
 
-def page(results: Sequence[Result], claims: Claims, rows: Sequence[Case]) -> str:
+def page(results: Sequence[Result], claims: Claims, cases: Sequence[Case]) -> str:
     """The leaderboard in Markdown: of each budget its agents by their mean RMSE here; losses and claims beside it."""
     here = {sample.name: sample.contender for sample in results[0].samples if sample.name in claims}
 
@@ -78,13 +77,13 @@ def page(results: Sequence[Result], claims: Claims, rows: Sequence[Case]) -> str
         places[spent] += 1
         claim, contract = claims[name]
         own = RMSE.text(results[0].means[name][RMSE.metric])
-        same = "the same" if contract == contract_hash(rows) else f"other: `{contract or 'unknown'}`"
+        same = "the same" if contract == contract_hash(cases) else f"other: `{contract or 'unknown'}`"
         seeds, lost = str(len(here[name].training_seeds)), f"{100.0 * mean(name, 'failure_rate'):.2f}"
         lines.append((spent, str(places[spent]), name, told, seeds, f"{claim:.3f}", own, lost, same))
-    seeds = f"{rows[0].first_seed} to {results[0].seeds[-1]}"
+    seeds = f"{cases[0].first_seed} to {results[0].seeds[-1]}"
     about = (
         f"Submitted agents on {len(results[0].seeds)} fresh crystals of each scenario (seeds {seeds}), by mean RMSE. "
-        f'"Claimed" and "here" are the RMSE on {rows[0].name}, from the submission and from these crystals.'
+        f'"Claimed" and "here" are the RMSE on {cases[0].name}, from the submission and from these crystals.'
     )
     beside = "Every scenario, beside classical controllers:"
     return "\n\n".join(["# Leaderboard", about, table(HEADS, lines), beside, summary(results)]) + "\n"
@@ -110,12 +109,12 @@ def _main(given: argparse.Namespace) -> None:
     if not submitted:
         raise CzError(f"{given.folder}: no submissions: each is a folder with agent files and benchmark.json")
     first = given.first_seed or FRESH[secrets.randbelow(len(FRESH) - len(TEST_SEEDS))]
-    rows = random_cases(first)
+    cases = random_cases(first)
     agents = [contender for contender, _ in submitted]
-    check_agents(agents, rows)
+    check_agents(agents, cases)
     contenders = [*(each for each in CONTROLLERS if each.quoted), *agents]
-    results = run(contenders, rows, given.episodes, given.out)
-    text = page(results, {contender.name: claim for contender, claim in submitted}, rows)
+    results = run(contenders, cases, given.episodes, given.out)
+    text = page(results, {contender.name: claim for contender, claim in submitted}, cases)
     command = f"python -m studies.leaderboard {given.folder} --episodes {given.episodes} --first-seed {first}"
     files = {"leaderboard.md": text, "leaderboard.json": to_json(results, command)}
     write_files({given.out / name: content.encode() for name, content in files.items()})

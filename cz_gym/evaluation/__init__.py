@@ -32,8 +32,8 @@ def plot(run: Rollout, episode: int = 0, path: str | Path | None = None) -> Figu
         raise IndexError(f"episode must be below {len(run.seeds)}, not {episode}")
     signals, dt = run.episode(episode), run.config.control_interval
     rmse = np.sqrt(np.mean(np.square(signals.r_c - signals.r_ref))) / MM
-    column = DrawnCrystal(f"RMSE {rmse:.3g} mm", signals, COLOURS[1], bool(run.failed[episode]))
-    figure = draw([column], dt, f"{run.config.scenario.name}, seed {run.seeds[episode]}")
+    crystal = DrawnCrystal(f"RMSE {rmse:.3g} mm", signals, COLOURS[1], bool(run.failed[episode]))
+    figure = draw([crystal], dt, f"{run.config.scenario.name}, seed {run.seeds[episode]}")
     if path is not None:
         write_files({Path(path): png(figure)})
     return figure

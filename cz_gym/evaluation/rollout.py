@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium.error import InvalidAction
 
 from cz_gym.action import mismatch
 from cz_gym.config import Config, check_config
@@ -85,7 +86,10 @@ def rollout(
             action, memory = call_policy(policy, observation, memory, begins)
             seconds += time.perf_counter() - before
             # An action may be marked with what it was made for; check_policy has said what fits.
-            observation, gained, terminated, truncated, info = env.step(np.asarray(action))
+            try:
+                observation, gained, terminated, truncated, info = env.step(np.asarray(action))
+            except InvalidAction as error:
+                raise CzError(f"{_where(policy)}, step {k}: {error}") from None
             for log, name in zip(signals, kind._fields, strict=True):
                 log[k] = info[name]
             reward[k], alive[k] = np.where(running, gained, 0.0), running
@@ -99,6 +103,13 @@ def rollout(
             if done > 1:
                 break
     return Rollout(config, seeds, signals, reward, alive, failed, start, seconds)
+
+
+def _where(policy: Any) -> str:
+    """The method that chose an action, with its file and line."""
+    code = getattr(type(policy).predict, "__code__", None)
+    place = f" ({code.co_filename}:{code.co_firstlineno})" if code else ""
+    return f"{type(policy).__name__}.predict{place}"
 
 
 def informed(policy: Any, config: Config, seeds: Sequence[int]) -> Any:

@@ -183,7 +183,7 @@ TABLES: dict[str, Callable[[], Lines]] = {
     "offline": partial(copied, "offline/lqg-mixed.txt", "offline/operator-paper.txt"),
     "on-pullers": on_pullers,
     "searches-crystal": partial(searches, "compensated", "lqg-along", "ring-pid-reduced"),
-    "searches-lqg": partial(searches, "lqg-at", "lqg-quiet", "lqg.", "lqg-puller", "lqg-sensor"),
+    "searches-lqg": partial(searches, "lqg-at", "lqg-quiet", "lqg.", "lqg-one", "lqg-puller", "lqg-sensor"),
     "searches-pid": partial(searches, *PIDS),
 }
 """Every table, by the name a page asks for it with."""

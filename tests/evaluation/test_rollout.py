@@ -189,3 +189,14 @@ def test_a_rollout_can_be_looked_at(tmp_path):
         plot("paper")
     with pytest.raises(IndexError, match="below 2"):
         plot(run, 2)
+
+
+@pytest.mark.parametrize("value", [np.nan, "a"])
+def test_actions_that_are_none_are_one_line_with_the_file_and_line_of_predict(value):
+    class Wrong:
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            return np.full((len(observation), 2), value), state
+
+    line = Wrong.predict.__code__.co_firstlineno
+    with pytest.raises(CzError, match=rf"^Wrong\.predict \(.*test_rollout\.py:{line}\), step 0: actions must"):
+        rollout(Wrong(), make_config(horizon=60.0), [0])

@@ -24,7 +24,7 @@ MARKERS = {
 """Matplotlib's markers with plotly's names for them."""
 DPI = 160
 COLUMNS = 6
-"""Largest number of controllers in the figure of a crystal and the short table: more would be too wide for a page."""
+"""Largest number of controllers in the figure of a crystal: more would be too wide for a page."""
 INK, GREY = "#222222", "#999999"
 
 
