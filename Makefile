@@ -33,7 +33,7 @@ lint: $(TEST_READY) ## format and lint
 
 # mypy reads no import hooks: it checks a copy in which agents and baselines lie where they are imported from.
 TYPES := build/types
-MYPY := rm -rf $(TYPES) && mkdir -p $(TYPES) && cp -r cz_gym studies examples tests *.py $(TYPES) && \
+MYPY := rm -rf $(TYPES) && mkdir -p $(TYPES) && cp -r cz_gym studies examples *.py $(TYPES) && \
 	cp -r agents baselines $(TYPES)/cz_gym && cd $(TYPES) && \
 	"$(CURDIR)/$(BIN)/mypy" --config-file ../../pyproject.toml --cache-dir ../../.mypy_cache
 types: $(TEST_READY) ## strict types

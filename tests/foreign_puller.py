@@ -25,6 +25,10 @@ QUIRKS = {
 }  # fmt: skip
 """What the machine does: [s], [K], heater in [W] and [W/s], pull in [mm/min] and [mm/min per s], camera in [mm], level
 in [mm/h] of the ring."""
+SLOW = {
+    "heater_slew": 1e3 / 60.0, "heater_step": 50.0, "pull_slew": 0.2 / 60.0, "pull_window": 0.3, "camera_noise": 0.05,
+}  # fmt: skip
+"""Quirks of slow drives: 1 kW/min in steps of 50 W, 0.3 mm/min, 0.2 mm/min in a minute."""
 REACH, MELT = 1e4, ((30.0, 0.25), (780.0, 0.25))
 """The heater's range about nominal [W]; times [s] and deviations [K] of the melt's fluctuations."""
 COLUMNS = "time_s", "ring_radius_mm", "pull_speed_mm_per_min", "heater_power_kW", "T_1_K"

@@ -10,9 +10,16 @@ from cz_gym.agents.training import validation
 from cz_gym.agents.training.recipes import PPO
 from cz_gym.baselines.registry import make_controller
 from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 
 SEEDS = range(1_000_000, 1_000_006)
+
+
+def test_crystals_that_judge_neither_select_nor_test():
+    judged = set(validation.JUDGING)
+    assert judged <= set(VALIDATION_SEEDS)
+    assert not judged & (set(validation.PICKING) | set(TEST_SEEDS))
 
 
 @pytest.mark.parametrize("scenario", ["randomized", "randomized=0.4,hard=0.2,puller=0.4"])

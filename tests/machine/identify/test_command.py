@@ -1,6 +1,5 @@
 """The command: a puller file, a report and pictures; or one line and nothing. The study, on three pullers."""
 
-import shutil
 from dataclasses import replace
 
 import pytest
@@ -9,7 +8,6 @@ from cz_gym.machine.identify import command
 from cz_gym.machine.puller import find_puller, read_puller, write_puller
 from examples import identify as example
 from studies import identify as study
-from studies import other_machine
 
 
 def test_the_command_writes_the_puller_and_its_report(logs, found, tmp_path, monkeypatch):
@@ -88,13 +86,3 @@ def test_the_study_identifies_pullers_that_nobody_knows(tmp_path, capsys, monkey
     text = (tmp_path / "pullers.txt").read_text()
     assert text in capsys.readouterr().out
     assert "tell the pull speed's path: 0\n" in text
-
-
-@pytest.mark.slow
-def test_a_machine_by_somebody_else_is_logged_identified_designed_for_and_driven(tmp_path):
-    if shutil.which("cc") is None:
-        pytest.skip("no C compiler")
-    row = other_machine.chain("heater's lag 10 s", crystals=1)
-    assert not row.identified.misfits
-    assert row.lost == (0, 0)
-    assert row.errors[0] < 2.0 * row.errors[1]

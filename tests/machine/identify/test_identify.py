@@ -25,8 +25,7 @@ from cz_gym.machine.puller import DEFAULT, find_puller
 from cz_gym.observation import MEASURED, decode
 from cz_gym.support.units import MM
 from studies.identify import draw, write_logs
-from studies.other_machine import SLOW
-from tests.foreign_puller import ForeignPuller, Operator, drive, write_log
+from tests.foreign_puller import SLOW, ForeignPuller, Operator, drive, write_log
 from tests.machine.identify.conftest import OWN, TRUTH
 
 
