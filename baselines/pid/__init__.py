@@ -1,1 +1,1 @@
-"""PID controllers: the paper's, filtered, re-tuned and conventional ones, and the industrial law."""
+"""PID controllers: the paper's, filtered, re-tuned and conventional ones."""

@@ -10,7 +10,6 @@ from cz_gym.baselines.analysis.frequency import LoopMargins, loop_margins
 from cz_gym.baselines.analysis.linear_form import linear_form
 from cz_gym.baselines.pid.compensated_pid import SeriesPID
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.pid.industrial import Industrial
 from cz_gym.body.linearisation import radius_model
 from cz_gym.body.plant import Puller, make_puller
 from cz_gym.config import Config
@@ -106,28 +105,30 @@ class TunedPID(Tuned):
 
     per_parameter: ClassVar[int] = 6
 
-    start: FilteredPID | Industrial
+    start: FilteredPID
     """Settings before the search."""
     parameters: tuple[Parameter, ...]
     limits: tuple[Limit, ...] = ()
+    hot_zones: bool = False
+    """False: a PID tuned without hot zones loses no more crystals there."""
 
-    def settings(self, scenario: Scenario) -> FilteredPID | Industrial:
+    def settings(self, scenario: Scenario) -> FilteredPID:
         """The controller with its tuned settings for a scenario, on the default puller."""
-        settings: FilteredPID | Industrial = with_values(self.start, for_scenario(self.name, scenario))
+        settings: FilteredPID = with_values(self.start, for_scenario(self.name, scenario))
         return settings
 
-    def make(self, config: Config) -> FilteredPID | Industrial:
+    def make(self, config: Config) -> FilteredPID:
         """The controller for an environment: tuned for its scenario, or for its puller if that is not the default."""
         if config.puller == DEFAULT or not self.on_puller:
             return self.settings(config.sole_scenario).for_config(config)
         values = for_puller(self.name, config.puller)
-        settings: FilteredPID | Industrial = with_values(scaled(self.settings(RANDOMIZED), config), values)
+        settings: FilteredPID = with_values(scaled(self.settings(RANDOMIZED), config), values)
         return settings
 
     def goal(self, scenario: Scenario) -> Goal:
         """Its search begins with the settings for ``randomized``."""
         start = self.settings(RANDOMIZED)
-        more = ROBUST if beyond(scenario, RANDOMIZED) and isinstance(start, FilteredPID) else ()
+        more = ROBUST if beyond(scenario, RANDOMIZED) else ()
         survive = ("hard", "hot-zone") if scenario == RANDOMIZED else ()
         return pid_goal(start, (*self.parameters, *more), survive, self.limits)
 
@@ -144,7 +145,6 @@ PAPER_TUNED = TunedPID(
     start=FilteredPID(T_track=300.0),
     parameters=(*LOOP, *COMPENSATOR),
     limits=(calm, insensitive),
-    hot_zones=False,  # it loses no more crystals there all the same
     quoted=True,
 )
 CONVENTIONAL = TunedPID(
@@ -153,7 +153,6 @@ CONVENTIONAL = TunedPID(
     start=FilteredPID(compensator=None, T_track=300.0),
     parameters=LOOP,
     limits=(calm, below_half_the_zero, insensitive),
-    hot_zones=False,
 )
 PIDS = (
     TunedPID(
@@ -161,18 +160,11 @@ PIDS = (
         meaning="the paper's controller with a measurement filter and anti-windup",
         start=FilteredPID(),
         parameters=(Parameter("T_f", 2.0, 200.0),),
-        hot_zones=False,
         on_puller=False,
         searched_on_puller=False,
     ),
     PAPER_TUNED,
     CONVENTIONAL,
-    TunedPID(
-        name="industrial",
-        meaning="incremental pull-speed law of a logged puller, with automatic growth control",
-        start=Industrial(),
-        parameters=(Parameter("T_f", 1.0, MINUTE), *HEATER),
-    ),
 )
 """Every tuned PID, in the order of tables."""
 

@@ -7,7 +7,6 @@ from functools import reduce
 from typing import Any
 
 from cz_gym.baselines.analysis.compensator_design import CUT_OFF, design_compensator
-from cz_gym.baselines.pid.industrial import Industrial
 from cz_gym.body.linearisation import RadiusModel, radius_model
 from cz_gym.body.plant import make_puller
 from cz_gym.config import Config
@@ -23,7 +22,7 @@ JUMP = 1.0 * MM
 PROPORTIONAL = {
     "time": ("pid.T_i", "pid.T_d", "T_f", "T_start", "T_track", "heater.T_i", "heater.T_pull", "heater.T_mean"),
     "rate": ("compensator.fast", "compensator.slow"),
-    "gain": ("pid.K_p", "gain"),
+    "gain": ("pid.K_p",),
     "compensator": ("compensator.gain",),
     "lead": ("ring_lead",),
     "heat": ("heater.K",),
@@ -70,7 +69,7 @@ def scaled(settings: Any, config: Config) -> Any:
     for name, factor in factors(config).items():
         for path in PROPORTIONAL[name]:
             value = reduce(lambda part, each: getattr(part, each, None), path.split("."), settings)
-            if value is not None and (path, type(settings)) != ("T_f", Industrial):  # it filters noise alone
+            if value is not None:
                 values[path] = factor * value
     if any(each.sensor.outlier_probability for each in config.scenario.scenarios) and hasattr(settings, "jump"):
         values["jump"] = config.puller.scale * JUMP

@@ -16,7 +16,7 @@ SCENARIOS = ("randomized", "hard", "sensor-fault", "puller", "hot-zone")
 OBSERVABLE = ("sensor-fault", "puller")
 """Scenarios whose true radius error holds an offset of the ring, which no sensor shows."""
 STEP = "pull_step_rms_mm_per_min"
-PIDS = ("paper", "paper-filtered", "paper-tuned", "pid-conventional", "industrial")
+PIDS = ("paper", "paper-filtered", "paper-tuned", "pid-conventional")
 LQGS = ("lqg", "lqg-quiet", "lqg-at-0.02", "lqg-at-0.02-adaptive", "lqg-one-design")
 CRYSTALS = ("ring-pid-reduced", "compensated", "lqg-along", "true-radius")
 PULLERS = ("silicon-300mm", "germanium")

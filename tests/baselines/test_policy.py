@@ -14,7 +14,6 @@ from cz_gym.baselines import CompensatedPID, Compensator, SeriesPID
 from cz_gym.baselines.lqg.model import NoiseModel
 from cz_gym.baselines.lqg.ring_model import RingModel
 from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.pid.industrial import Industrial
 from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
 from cz_gym.baselines.policy import Policy
 from cz_gym.baselines.registry import CONTROLLERS, find_controller, make_controller
@@ -27,7 +26,7 @@ from cz_gym.support.nested import map_arrays
 from tests.observed import PLAIN, actions_of, measured, observations
 
 CASES = [(entry.name, "randomized") for entry in CONTROLLERS if entry.observation == "measured" and not entry.slow]
-TUNED = ("pid-conventional", "paper-filtered", "paper-tuned", "industrial", "lqg")
+TUNED = ("pid-conventional", "paper-filtered", "paper-tuned", "lqg")
 CASES += [("paper-tuned", "puller"), ("lqg", "puller"), ("ekf-mpc", "puller")]
 
 
@@ -130,7 +129,7 @@ def test_readings_that_are_not_finite_are_not_read(name, bad, value, start):
         np.testing.assert_allclose(found[-1], usual[-1], atol=5e-3 if name.startswith("lqg") else 1e-7)
 
 
-@pytest.mark.parametrize("name", ["paper", "paper-tuned", "industrial", "lqg"])
+@pytest.mark.parametrize("name", ["paper", "paper-tuned", "lqg"])
 @pytest.mark.parametrize("garbage", [math.nan, 0.0, 9.0])
 def test_a_ring_that_is_not_valid_is_not_read(name, garbage):
     """It counts as the last valid ring, also while the reference moves."""
@@ -152,7 +151,6 @@ def test_a_ring_that_is_not_valid_is_not_read(name, garbage):
         (CompensatedPID, {"control_interval": 0.0}),
         (FilteredPID, {"T_f": -1.0}),
         (TemperatureLoop, {"T_i": 0.0}),
-        (Industrial, {"T_f": 0.0}),
         (NoiseModel, {"slow_tau": 0.0}),
         (RingModel, {"latency": -5.0}),
     ],

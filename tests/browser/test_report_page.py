@@ -21,7 +21,7 @@ WATCH = """new MutationObserver(() => document.querySelector(".main-svg") && per
 @pytest.fixture(scope="module")
 def made():
     """Two controllers and an agent with a name that is markup, on two scenarios."""
-    names = ("open-loop", "paper", "industrial")
+    names = ("open-loop", "paper", "pid-conventional")
     return [result_of(name, names, EVIL)[0] for name in ("puller", "reference-b")]
 
 

@@ -12,14 +12,14 @@ def entry(activity, rmse):
 
 def test_a_benchmark_is_compared_at_equal_activity(tmp_path, capsys):
     scenario = {name: entry(a, 0.01 * a**-0.5) for name, a in (("lqg-at-0.005", 0.005), ("lqg-quiet", 0.02))}
-    others = {"ppo": (0.01, 0.2), "industrial": (0.001, 0.4), "lively": (0.03, 0.1), "wild": (0.01, 0.5)}
+    others = {"ppo": (0.01, 0.2), "calm": (0.001, 0.4), "lively": (0.03, 0.1), "wild": (0.01, 0.5)}
     scenario |= {name: entry(*pair) for name, pair in others.items()}
     file = tmp_path / "benchmark.json"
     file.write_text(json.dumps({"results": {"randomized": scenario, "nominal": {"ppo": entry(0.01, 0.2)}}}))
     assert frontier.main([str(file)]) == 0
     told = capsys.readouterr().out
     assert "| ppo | 0.0100 | 0.2000 | 2.000 | -0 |" in told
-    assert "| industrial | 0.0010 | 0.4000 | quieter than any LQG | -0 |" in told
+    assert "| calm | 0.0010 | 0.4000 | quieter than any LQG | -0 |" in told
     assert "| lively | 0.0300 | 0.1000 | 1.414, more active than any LQG (0.0200) | -0 |" in told
     assert "1.00 over the 3 controllers outside the reference family, 0.82 with its members" in told
     assert "Of 9 pairs whose ratios are more than 5% apart, the return ranks 8 as the ratio does." in told

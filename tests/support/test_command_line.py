@@ -23,7 +23,7 @@ from tests.processes import python
 COMMANDS = [
     (benchmark, "--episode", "benchmark", ["--out", "new/folder"]),
     (paper, "--ou", "report", ["--out", "new/folder"]),
-    (tune, "--trial", "measure", ["--controller", "industrial", "--out", "new/folder"]),
+    (tune, "--trial", "measure", ["--controller", "pid-conventional", "--out", "new/folder"]),
     (speed, "--qui", "measure", ["--quick"]),
     (play, "--minute", "make_config", []),
     (datasets, "--episode", "record", ["--policies", "paper", "--out", "new/folder"]),
@@ -42,7 +42,7 @@ def name(part):
 @pytest.mark.parametrize("abbreviated", [False, True])
 @pytest.mark.parametrize(("module", "beginning"), [row[:2] for row in COMMANDS], ids=name)
 def test_an_unknown_option_is_refused_in_one_line(module, beginning, abbreviated, refused):
-    required = ["--controller", "industrial"] if module is tune else []
+    required = ["--controller", "pid-conventional"] if module is tune else []
     line = refused(module.main, [*required, beginning if abbreviated else "--frobnicate"])
     assert "unrecognized arguments" in line
 

@@ -291,7 +291,7 @@ def test_the_command_writes_what_the_search_chose(name, said, trials, scenario, 
     ("given", "said"),
     [
         (["--controller", "nobody"], "unknown controller to tune 'nobody'"),
-        (["--controller", "industrial", "--scenario", "moon"], "moon"),
+        (["--controller", "pid-conventional", "--scenario", "moon"], "moon"),
         (["--controller", "lqg-along", "--scenario", "hard"], "lqg-along has one search: leave --scenario hard out"),
         (["--controller", "lqg", "--scenario", "hard"], "lqg has no goal on 'hard', but on randomized"),
     ],

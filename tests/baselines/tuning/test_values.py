@@ -28,7 +28,7 @@ def test_named_scenarios_have_their_own_settings_or_those_of_randomized(scenario
 @pytest.mark.parametrize("scenario", TUNED, ids=[each.name for each in TUNED])
 def test_another_name_changes_nothing(scenario):
     other = replace(scenario, name="mine", drift=replace(scenario.drift, amount=(-1.0, 1.0)))
-    for name in ("lqg", "lqg-at-0.02", "paper-tuned", "industrial"):
+    for name in ("lqg", "lqg-at-0.02", "paper-tuned"):
         ours, theirs = (make_controller(name, make_config(each, **PLAIN)) for each in (other, scenario))
         assert ours == theirs
 

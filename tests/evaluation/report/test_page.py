@@ -17,7 +17,7 @@ from cz_gym.evaluation.report.tables import DRIVES, ERROR, comparison, overview
 from tests.samples import result_of
 
 EVIL = "</script><img src=x onerror=alert(1)>\"'&amp;<b>\u2028%{x}|"
-ROWS, NAMES = ("puller", "reference-b"), ("open-loop", "paper", "industrial")
+ROWS, NAMES = ("puller", "reference-b"), ("open-loop", "paper", "pid-conventional")
 STEP = 9
 """Steps of 5 s that a point of a line is the mean of."""
 

@@ -31,7 +31,7 @@ from studies.export import LARGEST, report, study
 from studies.faults import FAULTS, grow
 from tests.machine.export.structured_text import FunctionBlock
 
-CONTROLLERS = ("paper", "paper-tuned", "industrial", "lqg", "gradient", "ppo")
+CONTROLLERS = ("paper", "paper-tuned", "pid-conventional", "lqg", "gradient", "ppo")
 needs_compiler = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed: no C can be compiled")
 PULL, HEATER, ALARMS = "pull_speed_setpoint_mm_per_min", "heater_power_setpoint_kW", "alarms"
 
@@ -114,7 +114,7 @@ class Plant:
 
 @pytest.mark.parametrize(
     ("name", "scenario"),
-    [("paper", "puller"), ("industrial", "puller"), ("lqg", "puller"), ("lqg-at-0.02", "sensor-fault")],
+    [("paper", "puller"), ("pid-conventional", "puller"), ("lqg", "puller"), ("lqg-at-0.02", "sensor-fault")],
 )
 def test_a_block_computes_what_the_controller_computes(name, scenario):
     config, n = config_of(scenario), 3

@@ -97,7 +97,7 @@ def test_steps_of_a_heater_that_no_controller_moves_count(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["paper-tuned", "lqg-at-0.02", "industrial"])
+@pytest.mark.parametrize("name", ["paper-tuned", "lqg-at-0.02", "pid-conventional"])
 def test_controllers_alone_excite_nothing_whatever_their_law(name, tmp_path):
     """The LQG alone leaves pull moves of 25 times what is needed that no linear law explains (seed 7)."""
     for seed in (1, 2, 7, 9):
