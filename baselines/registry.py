@@ -6,7 +6,6 @@ from functools import partial
 from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
 from cz_gym.baselines.bounds.lqg import full_information, privileged
 from cz_gym.baselines.lqg.controller import LQG, LQGDesign
-from cz_gym.baselines.mpc import ekf_mpc
 from cz_gym.baselines.pid.compensated_pid import CompensatedPID
 from cz_gym.baselines.tuning.crystal import CRYSTALS, RING_PID, TRUE_PID, in_proportion
 from cz_gym.baselines.tuning.lqg import BEST_RETURN, FILTER, LQGS, TunedLQG, adaptive
@@ -63,13 +62,6 @@ CONTROLLERS: tuple[Contender, ...] = (
             default=each.default,
         )
         for each in (_CALM, _IN_TABLE)
-    ),
-    _measured(
-        "ekf-mpc",
-        partial(_designed, ekf_mpc),
-        meaning="nonlinear MPC on a bank of lqg's filters",
-        default=False,
-        slow=True,
     ),
     _bound(
         "lqg-true",

@@ -27,7 +27,7 @@ from .rollout import Floats
 
 PRINTED = 1e-4
 """Relative precision of the figures in ``episodes.csv``, five digits [-]."""
-COMPUTING = ("numpy", "scipy", "numba", "casadi")
+COMPUTING = ("numpy", "scipy", "numba")
 """Packages whose version the figures may depend on."""
 PICTURES = ("camera", "rendering")
 """Sub-packages that draw: no cached figure depends on them."""

@@ -22,7 +22,7 @@ from .protocol import contract_hash
 from .results import BOUND, REFERENCE, Result
 from .statistics import RESAMPLES, SEED, Estimate
 
-PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime", "casadi")
+PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime")
 """Packages whose versions are recorded."""
 FACTS = ("name", "observation", "meaning", "training_seeds", "privileged", "slow", "action", "own")
 """What is recorded of a contender."""

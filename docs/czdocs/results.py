@@ -170,7 +170,6 @@ TABLES: dict[str, Callable[[], Lines]] = {
     "figures-lqg": partial(figures, "benchmark", LQGS),
     "figures-budgets": partial(figures, "budgets", BUDGETS, ("randomized", "puller")),
     "figures-bounds": partial(figures, "bounds", BOUNDS, SCENARIOS[:-1]),
-    "figures-mpc": partial(figures, "bounds", ("lqg", "lqg-quiet", "ekf-mpc"), SCENARIOS[:-1]),
     "faults": faults,
     "gaps": gaps,
     "ratios": equal,

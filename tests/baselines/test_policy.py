@@ -27,7 +27,7 @@ from tests.observed import PLAIN, actions_of, measured, observations
 
 CASES = [(entry.name, "randomized") for entry in CONTROLLERS if entry.observation == "measured" and not entry.slow]
 TUNED = ("pid-conventional", "paper-filtered", "paper-tuned", "lqg")
-CASES += [("paper-tuned", "puller"), ("lqg", "puller"), ("ekf-mpc", "puller")]
+CASES += [("paper-tuned", "puller"), ("lqg", "puller")]
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_a_controller_can_be_made_for_another_environment_or_for_any(option):
 
 # Readings that are no numbers, and settings that are none
 
-READERS = [entry.name for entry in CONTROLLERS if entry.observation != "state" and entry.name != "ekf-mpc"]
+READERS = [entry.name for entry in CONTROLLERS if entry.observation != "state"]
 BAD = st.lists(st.sets(st.integers(0, len(MEASURED) - 1), min_size=1), min_size=1, max_size=4)
 ROW = measured(ring_error=1e-5, r_ref=2e-4, r_ref_1min=2e-4, r_ref_5min=2e-4, T_1=0.1, v_p=1e-7, Q_H=50.0)
 

@@ -218,7 +218,7 @@ USES = {
     "benchmark": "run('benchmark --controllers paper --scenarios nominal --episodes 1 --quiet --out', out)",
     "agents": "import cz_gym.agents.training.fleet, cz_gym.agents.apg, cz_gym.agents.export, cz_gym.agents.asymmetric",
     "render": "import gymnasium; e = gymnasium.make('cz_gym:Cz-v0', render_mode='rgb_array'); e.reset(); e.render()",
-    "mpc": "from cz_gym.baselines import mpc, registry as r; import cz_gym.config as c; r.find_controller('ekf-mpc')",
+    "mpc": "from examples.mpc import mpc; import cz_gym.config as c; mpc(c.make_config('nominal')).programme",
     "data": "run('data --policies paper --scenarios nominal --episodes 1 --out', out)",
     "cluster": "import cz_gym.evaluation.cluster as c, distributed; distributed.Client; c.versions()",
     "plant": "import cz_gym.machine.serve.command; run('export --plant --to fmu --out', out)",
