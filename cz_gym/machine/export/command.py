@@ -15,26 +15,23 @@ from cz_gym.support.units import KILO, MM_PER_MIN
 
 from .compiled import memory_of
 from .controllers import make_block
-from .onnx_graph import write_onnx
 from .ports import Alarm, meanings
 from .program import Program
 from .shell import Block
 from .text import fill_template, write_c, write_st
 from .vector import shadow, test_vector
 
-WRITERS: dict[str, Any] = {"c": write_c, "st": write_st, "onnx": write_onnx}
+WRITERS: dict[str, Any] = {"c": write_c, "st": write_st}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the files; 0 when done, 2 for bad input."""
-    about = (
-        "Write a controller, and what a plant needs around it, as C99, structured text or ONNX; or the puller as FMU."
-    )
+    about = "Write a controller, and what a plant needs around it, as C99 or structured text; or the puller as FMU."
     parser = OneLineParser("cz-gym export", about)
     add = parser.add_argument
     add("controller", nargs="?", help="a classical controller, a shipped agent, or an agent file (.onnx)")
     add("--plant", action="store_true", help="the puller in place of a controller (--to fmu)")
-    add("--to", choices=("c", "fmu", "onnx", "st"), help="C99, FMI, ONNX, IEC 61131-3 structured text")
+    add("--to", choices=("c", "fmu", "st"), help="C99, FMI, IEC 61131-3 structured text")
     add("--shadow", type=Path, metavar="LOG", help="in place of --to: run the controller beside a log, and report")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
     parser.add_puller("its nominal values, its drives' limits, what is designed for it")
@@ -47,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _export(given: argparse.Namespace) -> None:
     fmu, asked = given.to == "fmu", bool(given.to) != bool(given.shadow)
     if not asked or given.plant != fmu or given.plant == bool(given.controller):
-        raise CzError("name a controller and --to c, st or onnx, or --shadow LOG; or --plant --to fmu")
+        raise CzError("name a controller and --to c or st, or --shadow LOG; or --plant --to fmu")
     if given.scenario and given.puller and not given.plant:
         raise CzError("--scenario is for the default puller: a puller file has settings whatever the scenario")
     config = make_config(given.scenario or "puller", observation="measured", action="direct", puller=given.puller)
@@ -84,8 +81,6 @@ def readme(block: Block, files: list[str], single: bool) -> str:
     kinds = {
         ".h": "declarations", ".c": "the block", ".st": "the function block",
         ".csv": "a test vector: inputs and outputs of calls one after the other, with the default settings, for a port",
-        ".onnx": "the block as a graph in double precision, inputs of shape [1]; the output `next_memory` is the input "
-        "`memory` of the next call, which the first call leaves out",
     }  # fmt: skip
     program, config = block.program, block.config
     parts = {
