@@ -10,16 +10,16 @@ from importlib import import_module
 from importlib.metadata import version
 
 COMMANDS = {
-    "train": ("cz_gym.commands.train", "train an agent by a recipe"),
-    "benchmark": ("cz_gym.commands.benchmark", "compare controllers and agents on the same crystals"),
-    "tune": ("cz_gym.commands.tune", "search settings of controllers, or design them for a puller"),
-    "identify": ("cz_gym.machine.identify.command", "estimate a puller's numbers from its log"),
-    "puller": ("cz_gym.machine.describe", "print what a puller file implies"),
-    "recipe": ("cz_gym.commands.recipe", "set points of a whole crystal against its length"),
-    "export": ("cz_gym.machine.export.command", "write a controller or agent as code for a PLC"),
-    "serve": ("cz_gym.machine.serve.command", "run a virtual puller on OPC UA"),
-    "play": ("cz_gym.commands.play", "pull a crystal by hand"),
-    "data": ("cz_gym.datasets", "record datasets for offline learning"),
+    "train": ("cz_gym.tools.train", "train an agent by a recipe"),
+    "benchmark": ("cz_gym.tools.benchmark", "compare controllers and agents on the same crystals"),
+    "tune": ("cz_gym.tools.tune", "search settings of controllers, or design them for a puller"),
+    "identify": ("cz_gym.tools.identify.command", "estimate a puller's numbers from its log"),
+    "puller": ("cz_gym.tools.puller", "print what a puller file implies"),
+    "recipe": ("cz_gym.tools.recipe", "set points of a whole crystal against its length"),
+    "export": ("cz_gym.tools.export.command", "write a controller or agent as code for a PLC"),
+    "serve": ("cz_gym.tools.serve.command", "run a virtual puller on OPC UA"),
+    "play": ("cz_gym.tools.play", "pull a crystal by hand"),
+    "data": ("cz_gym.tools.datasets", "record datasets for offline learning"),
 }
 """For each word its module, whose ``main`` takes the arguments after it, and what it does."""
 HELP = "\n".join([

@@ -9,11 +9,12 @@ if __name__ != "cz_gym.agents":
 
 from pathlib import Path
 
-from cz_gym.agents.agent_file.contract import AgentFileError, Contract, read_agent
-from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.config import Config
 from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.support.names import unknown
+
+from .contract import AgentFileError, Contract, read_agent
+from .policy import OnnxPolicy
 
 __all__ = ["AgentFileError", "Contract", "OnnxPolicy", "load", "shipped", "shipped_names", "shipped_seeds"]
 

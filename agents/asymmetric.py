@@ -22,9 +22,9 @@ from torch import nn
 from torch.nn.functional import huber_loss
 
 from cz_gym.crystal.process import ENVIRONMENTS
-from cz_gym.errors import CzError
-from cz_gym.observation import observations
 from cz_gym.process import Channel
+from cz_gym.spaces import observations
+from cz_gym.support.errors import CzError
 from cz_gym.support.names import needs
 
 GAINS = {

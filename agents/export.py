@@ -14,15 +14,16 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
-from cz_gym.agents.agent_file.contract import AgentFileError, facts_of, make_contract
-from cz_gym.agents.agent_file.graph import INPUTS, OUTPUTS
-from cz_gym.agents.apg import APG, RecurrentPolicy
-from cz_gym.agents.asymmetric import Asymmetric
-from cz_gym.agents.policies.onnx import OnnxPolicy
 from cz_gym.config import Config
-from cz_gym.evaluation.contender import PLANT, REWARD, STATE
-from cz_gym.observation import observations
+from cz_gym.evaluation.protocol import PLANT, REWARD, STATE
 from cz_gym.sb3 import environment_steps
+from cz_gym.spaces import observations
+
+from .apg import APG, RecurrentPolicy
+from .asymmetric import Asymmetric
+from .contract import AgentFileError, facts_of, make_contract
+from .graph import INPUTS, OUTPUTS
+from .policy import OnnxPolicy
 
 OPSET, IR_VERSION = 17, 9
 

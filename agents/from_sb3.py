@@ -17,18 +17,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cz_gym.agents.agent_file.contract import AgentFileError, Contract, agent_files
-from cz_gym.agents.policies.onnx import OnnxPolicy
-from cz_gym.agents.training.validation import JUDGING, validate
 from cz_gym.config import Config, check_config, make_config
-from cz_gym.env import CzEnv, observation_space
+from cz_gym.env import CzEnv, CzVectorEnv, observation_space
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.user_code import scenarios
-from cz_gym.observation import observations
-from cz_gym.support.atomic_files import write_files
+from cz_gym.spaces import observations
 from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.files import write_files
 from cz_gym.support.names import needs
-from cz_gym.vector import CzVectorEnv
+
+from .contract import AgentFileError, Contract, agent_files
+from .policy import OnnxPolicy
+from .validation import JUDGING, validate
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -74,7 +74,7 @@ def save_agent(
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.vec_env import VecNormalize
 
-    from cz_gym.agents.export import to_agent
+    from .export import to_agent
 
     path = Path(path)
     if path.suffix != ".onnx":
@@ -171,7 +171,7 @@ def _check_wrappers(model: BaseAlgorithm) -> None:
 
 def _check_spaces(model: BaseAlgorithm, config: Config) -> None:
     """AgentFileError unless the model reads and acts as the environment of these settings wants."""
-    from cz_gym.agents.asymmetric import Asymmetric
+    from .asymmetric import Asymmetric
 
     wanted = (len(observations(config.process).get(config.observation, ())),), (2,)
     shapes = model.observation_space.shape, model.action_space.shape
@@ -190,7 +190,7 @@ def _check_normalisation(model: BaseAlgorithm, normalisation: VecNormalize | Non
     A saved model keeps its last observation: there the camera's flag is 0 or 1 unless it is normalised. A model that is
     loaded into an environment has lost that, but keeps the last original observation before a VecNormalize.
     """
-    from cz_gym.agents.asymmetric import Asymmetric
+    from .asymmetric import Asymmetric
 
     if normalisation is not None:
         return

@@ -3,8 +3,7 @@
 if __name__ != "cz_gym.baselines":
     raise ImportError("import cz_gym.baselines: the folder baselines is that package, under no other name")
 
-from cz_gym.baselines.pid.compensated_pid import CompensatedPID, Compensator, SeriesPID
-
+from .pid import CompensatedPID, Compensator, SeriesPID
 from .policy import OpenLoop, Policy
 
 __all__ = ["CompensatedPID", "Compensator", "OpenLoop", "Policy", "SeriesPID"]

@@ -1,6 +1,6 @@
 """The PID that takes over from any controller: searched for a puller's drives, latency and noise, within margins.
 
-It is a :class:`~cz_gym.baselines.pid.filtered_pid.FilteredPID` without compensator. The search minimises what a
+It is a :class:`~cz_gym.baselines.pid.FilteredPID` without compensator. The search minimises what a
 drifting heat load does to radius and pull speed on the puller's linear models, with a price on pull steps. It takes no
 settings whose loop, opened at the camera, has less than GAIN_MARGIN or PHASE_MARGIN on Model I or II.
 """
@@ -13,22 +13,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.signal import cont2discrete
 
-from cz_gym.baselines.analysis.linear_form import linear_form
-from cz_gym.baselines.analysis.sampled_loop import close
-from cz_gym.baselines.pid.compensated_pid import SeriesPID
-from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.policy import Floats
-from cz_gym.baselines.tuning.lqg import MEAN_RIPPLE
-from cz_gym.baselines.tuning.pid import CONVENTIONAL
-from cz_gym.baselines.tuning.scaling import PROPORTIONAL, factors, scaled
-from cz_gym.baselines.tuning.values import with_values
-from cz_gym.body.linearisation import INPUTS, OUTPUTS, STATES, linearise
-from cz_gym.body.plant import Puller, make_puller
+from cz_gym.body.process import INPUTS, OUTPUTS, STATES, linearise
 from cz_gym.config import Config
 from cz_gym.episodes.scenarios import RANDOMIZED
-from cz_gym.errors import CzError
-from cz_gym.machine.puller import DEFAULT
+from cz_gym.physics.plant import Puller, make_puller
+from cz_gym.puller.file import DEFAULT
+from cz_gym.support.errors import CzError
 from cz_gym.support.units import MM, MM_PER_MIN
+
+from .analysis import close, linear_form
+from .pid import FilteredPID, SeriesPID
+from .policy import Floats
+from .tuned import with_values
+from .tuned_lqg import MEAN_RIPPLE
+from .tuned_pid import CONVENTIONAL, PROPORTIONAL, factors, scaled
 
 GAIN_MARGIN, PHASE_MARGIN = 2.5, 45.0
 """Least margins of the loop opened at the camera [-, degrees]; the gain may fall by as much as it may grow."""
@@ -74,7 +72,7 @@ class _Plant(NamedTuple):
     noise: float
     """Standard deviation of a ring reading [m]."""
     scale: dict[str, float]
-    """:func:`cz_gym.baselines.tuning.scaling.factors`."""
+    """:func:`cz_gym.baselines.tuned_pid.factors`."""
 
 
 def fallback(config: Config) -> Fallback:

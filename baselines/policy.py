@@ -9,16 +9,16 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.action import MadeFor, mark
 from cz_gym.body.process import BODY
+from cz_gym.body.signals import Measured
 from cz_gym.config import Config, positive
-from cz_gym.errors import CzError
-from cz_gym.machine.puller import DEFAULT, PullerFile
-from cz_gym.observation import Measured, decode, readable
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.process import Process
-from cz_gym.support.nested import select
+from cz_gym.puller.file import DEFAULT, PullerFile
+from cz_gym.spaces import MadeFor, decode, mark, readable
+from cz_gym.support.errors import CzError
+from cz_gym.support.names import select
 
 Floats = npt.NDArray[np.float64]
 

@@ -19,16 +19,15 @@ except ModuleNotFoundError as error:
         sys.exit(said)
     raise ModuleNotFoundError(said, name=error.name) from None
 
-from cz_gym.body.plant import Puller, State, make_puller
 from cz_gym.episodes.scenario import Scenario
 from cz_gym.episodes.scenarios import SCENARIOS
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
+from cz_gym.physics.plant import Puller, State, make_puller
 
 from .config import Config
-from .env import CzEnv, EnvState
-from .observation import decode
-from .vector import CzVectorEnv
+from .env import CzEnv, CzVectorEnv, EnvState
+from .spaces import decode
 
 
 def _beside(name: str, *_: object) -> ModuleSpec | None:
@@ -62,11 +61,11 @@ __all__ = [
     "make_puller",
 ]
 
-gym.register(id=ENV_ID, entry_point="cz_gym.env:CzEnv", vector_entry_point="cz_gym.vector:CzVectorEnv")
+gym.register(id=ENV_ID, entry_point="cz_gym.env:CzEnv", vector_entry_point="cz_gym.env:CzVectorEnv")
 gym.register(
     id="CzCrystal-v0",
-    entry_point="cz_gym.crystal_env:CzCrystalEnv",
-    vector_entry_point="cz_gym.crystal_env:CzCrystalVectorEnv",
+    entry_point="cz_gym.env:CzCrystalEnv",
+    vector_entry_point="cz_gym.env:CzCrystalVectorEnv",
 )
 
 

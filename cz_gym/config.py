@@ -14,20 +14,19 @@ import numpy as np
 
 from cz_gym.body.process import BODY
 from cz_gym.camera.view import Camera, camera_for, check_camera
-from cz_gym.episodes.mixture import AnyScenario, Distribution
-from cz_gym.episodes.record import Factors
-from cz_gym.episodes.scenario import Range, Scenario
+from cz_gym.episodes.adapt import adapt_scenario
+from cz_gym.episodes.draw import Factors
+from cz_gym.episodes.scenario import AnyScenario, Distribution, Scenario
 from cz_gym.episodes.scenarios import RANDOMIZED, find_distribution, find_scenario, mix_of
-from cz_gym.errors import CzError
-from cz_gym.machine.adapt import adapt_scenario
-from cz_gym.machine.puller import DEFAULT, PullerFile, find_puller
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
-from cz_gym.process import Inputs, Process
+from cz_gym.physics.quantities import Range
+from cz_gym.puller.file import DEFAULT, PullerFile, find_puller
+from cz_gym.support.errors import CzError
 from cz_gym.support.names import needs, unknown
 
-from .action import ACTIONS, MadeFor
-from .observation import CAMERA, OBSERVATIONS
+from .process import Inputs, Process
+from .spaces import ACTIONS, CAMERA, OBSERVATIONS, MadeFor
 
 VERSION = 0
 """Version of the environment's contract; a change of it, or of physics, makes a Cz-v1."""
@@ -72,7 +71,7 @@ class Config:
     model: str | float | None = None
     observation: str = "history"
     action: str = "smooth"
-    """Action mode: "direct", "smooth" or "rate" (:func:`cz_gym.action.drives_of`)."""
+    """Action mode: "direct", "smooth" or "rate" (:func:`cz_gym.spaces.drives_of`)."""
     control_interval: float = 5.0
     """Time between actions [s]."""
     horizon: float = 10800.0
@@ -86,7 +85,7 @@ class Config:
     process: Process = field(default=BODY, repr=False)
     """What is simulated."""
     weights: Any = BODY.weights
-    """Weights of the reward's terms (:class:`cz_gym.body.cost.Weights`)."""
+    """Weights of the reward's terms (:class:`cz_gym.body.signals.Weights`)."""
 
     @property
     def ranges(self) -> tuple[float, float]:

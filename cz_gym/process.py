@@ -4,9 +4,9 @@ Its types say which numbers there are, its functions what becomes of them. Slots
 and channels of observations follow from the types; ``Cz-v0`` is :data:`cz_gym.body.process.BODY`.
 
 Every process stands in a puller: two drives move it (:class:`Inputs`), a camera and a pyrometer see it (:class:`Seen`),
-a scenario disturbs it (:class:`cz_gym.episodes.record.Episode`). All functions take SI units and are pure, but for
-``begin``, and marked :func:`cz_gym.jit.compile.jittable`. ``p`` are the puller's constants, ``e`` is the episode, ``m``
-the meniscus model, ``t`` the time [s]. ``slot`` is a record of :func:`cz_gym.engine.layout.slot_type`, with
+a scenario disturbs it (:class:`cz_gym.episodes.draw.Episode`). All functions take SI units and are pure, but for
+``begin``, and marked :func:`cz_gym.jit.jittable`. ``p`` are the puller's constants, ``e`` is the episode, ``m``
+the meniscus model, ``t`` the time [s]. ``slot`` is a record of :func:`cz_gym.engine.slots.slot_type`, with
 ``slot.puller``, ``slot.episode``, ``slot.x``, the drives and the last readings.
 
 Another process is one more value, in a room of its own:
@@ -33,9 +33,10 @@ from typing import Any, NamedTuple, get_type_hints
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.errors import CzError
-from cz_gym.jit.compile import jittable, static
+from cz_gym.support.errors import CzError
 from cz_gym.support.units import HOUR, KILO, MM_PER_MIN
+
+from .jit import jittable, static
 
 GROWS, LOST, DONE = 0, 1, 2
 """What ``accept`` says of a substep: it goes on, it ends in failure, it ends with success."""
@@ -165,7 +166,7 @@ class Process(NamedTuple):
     """``check(parameters, meniscus)``: the parameters, checked; CzError if nothing can grow with them."""
     derive: Function
     """``derive(parameters, factors, m)``: ``Constants`` at these factors of the hot zone
-    (:class:`cz_gym.episodes.record.Factors`)."""
+    (:class:`cz_gym.episodes.draw.Factors`)."""
     begin: Function
     """``begin(slot, m)``: the first ``State``; sets ``Extra`` and the table in the slot."""
     nominal: Function
@@ -221,7 +222,7 @@ class Process(NamedTuple):
     """Rows and columns of ``slot.table``, which ``begin`` fills; none by default."""
     complete: Function = no_stages
     """``complete(parameters, machine, stage)``: the parameters that ``check`` takes, of a puller's, its file
-    (:class:`cz_gym.machine.puller.PullerFile`) and the stage that the user names; CzError if there is no such stage."""
+    (:class:`cz_gym.puller.file.PullerFile`) and the stage that the user names; CzError if there is no such stage."""
     apart: tuple[str, ...] = ()
     """Parameters that say what an episode grows; the plant does not depend on them."""
     duration: Function = three_hours

@@ -16,11 +16,11 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_wrapper
 
 from cz_gym.crystal.process import ENVIRONMENTS
-from cz_gym.env import EnvState
-from cz_gym.errors import CzError
-from cz_gym.observation import observations
+from cz_gym.support.errors import CzError
 from cz_gym.support.names import needs, unknown
-from cz_gym.vector import CzVectorEnv
+
+from .env import CzVectorEnv, EnvState
+from .spaces import observations
 
 
 def make_vec_env(

@@ -13,7 +13,7 @@ try:
 except ModuleNotFoundError as error:
     sys.exit(f'{error.name} is missing: make venv, then .venv/bin/python, or pip install ".[agents]"')
 
-from cz_gym.agents.agent_file.contract import Contract
+from cz_gym.agents.contract import Contract
 from cz_gym.agents.from_sb3 import save_agent
 from cz_gym.sb3 import make_vec_env
 

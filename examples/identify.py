@@ -7,14 +7,14 @@ import sys
 from pathlib import Path
 
 from cz_gym import CzEnv, Parameters
-from cz_gym.baselines.registry import make_controller
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.machine.identify import Excited, identify, read_log, record_log
-from cz_gym.machine.identify.report import report
-from cz_gym.machine.puller import PullerFile, find_puller, to_toml
-from cz_gym.support.atomic_files import write_files
+from cz_gym.puller.file import PullerFile, find_puller, to_toml
+from cz_gym.support.files import write_files
+from cz_gym.tools.identify import Excited, identify, read_log, record_log
+from cz_gym.tools.identify.command import report
+from cz_gym.tools.registry import make_controller
 
 
 def make_log(path: str) -> str:

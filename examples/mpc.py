@@ -18,14 +18,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from cz_gym.baselines.lqg.controller import LQG
-from cz_gym.baselines.lqg.model import DRIFT, HEATER, PLANT, STATES
-from cz_gym.baselines.lqg.regulator import quadratic_cost, samples_ahead
+from cz_gym.baselines.lqg import LQG, quadratic_cost, samples_ahead
+from cz_gym.baselines.lqg_filter import DRIFT, HEATER, PLANT, STATES
 from cz_gym.baselines.policy import Floats
-from cz_gym.baselines.tuning.lqg import BEST_RETURN
-from cz_gym.body.plant import Disturbance, Inputs, State, hidden_load, rk4
+from cz_gym.baselines.tuned_lqg import BEST_RETURN
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Actuators
+from cz_gym.physics.plant import Disturbance, State, hidden_load, rk4
+from cz_gym.process import Inputs
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
 
 SCALE = np.array([MM, MM, 1.0, 1.0, 1.0, MM_PER_MIN, KILO])

@@ -17,15 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cz_gym.action import drives_of
 from cz_gym.config import make_config
-from cz_gym.datasets import main as write_datasets
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
-from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.observation import DRIVE_CHANNELS
-from cz_gym.support.atomic_files import write_files
+from cz_gym.spaces import DRIVE_CHANNELS, drives_of
+from cz_gym.support.files import write_files
+from cz_gym.tools.datasets import main as write_datasets
+from cz_gym.tools.report.tables import markdown
 
 SETS = ("lqg", "mixed", "operator", "paper")
 SEEDS = 3

@@ -1,4 +1,4 @@
-"""A controller of a puller over OPC UA: any that ``cz_gym.machine.export`` can write, in Python or as compiled C.
+"""A controller of a puller over OPC UA: any that ``cz_gym.tools.export`` can write, in Python or as compiled C.
 
 It reads the tags of ``cz-gym serve``, calls the exported block, which has inputs of the same names,
 and writes both setpoints and the step that they answer.
@@ -17,14 +17,14 @@ from asyncua import Client, ua
 from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 
 from cz_gym.config import Config, make_config
-from cz_gym.errors import CzError
-from cz_gym.machine.export.compiled import CompiledBlock
-from cz_gym.machine.export.controllers import make_block
-from cz_gym.machine.export.policy import Runner
-from cz_gym.machine.export.ports import SETPOINTS
-from cz_gym.machine.serve.machine import TAGS
-from cz_gym.machine.serve.opcua import URI, WRITABLE, certify, password
 from cz_gym.support.command_line import OneLineParser, between
+from cz_gym.support.errors import CzError
+from cz_gym.tools.export.block import SETPOINTS
+from cz_gym.tools.export.controllers import make_block
+from cz_gym.tools.export.shell import Runner
+from cz_gym.tools.export.text import CompiledBlock
+from cz_gym.tools.serve.machine import TAGS
+from cz_gym.tools.serve.opcua import URI, WRITABLE, certify, password
 
 
 class Controller:

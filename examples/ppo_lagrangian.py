@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
 from cz_gym import CzVectorEnv
-from cz_gym.agents.agent_file.contract import Contract
+from cz_gym.agents.contract import Contract
 from cz_gym.agents.from_sb3 import save_agent
 from cz_gym.sb3 import ActionRepeat, CzVecEnv
 

@@ -11,7 +11,7 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
-from cz_gym.agents.agent_file.contract import Contract
+from cz_gym.agents.contract import Contract
 from cz_gym.agents.from_sb3 import save_agent
 from cz_gym.sb3 import make_vec_env
 

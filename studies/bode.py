@@ -12,19 +12,27 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.baselines.analysis.frequency import frequencies, loop_margins, opened, response
-from cz_gym.baselines.analysis.linear_form import LinearForm, linear_form
-from cz_gym.baselines.analysis.sampled_loop import HOT_ZONE, close, stable_range
-from cz_gym.baselines.registry import make_controller
-from cz_gym.body.plant import make_puller
+from cz_gym.baselines.analysis import (
+    HOT_ZONE,
+    LinearForm,
+    close,
+    frequencies,
+    linear_form,
+    loop_margins,
+    opened,
+    response,
+    stable_range,
+)
 from cz_gym.config import make_config
-from cz_gym.errors import CzError
 from cz_gym.evaluation import user_code
-from cz_gym.evaluation.report.tables import markdown as table
-from cz_gym.machine import puller as machine
-from cz_gym.physics.linearisation import StateSpace
-from cz_gym.support.atomic_files import check_writable, write_files
+from cz_gym.physics.numerics import StateSpace
+from cz_gym.physics.plant import make_puller
+from cz_gym.puller import file as machine
 from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.errors import CzError
+from cz_gym.support.files import check_writable, write_files
+from cz_gym.tools.registry import make_controller
+from cz_gym.tools.report.tables import markdown as table
 
 PLACES = {"camera": "ring", "v_p": "pull speed", "Q_H": "heater"}
 """Places where the loop is opened, and their names."""
@@ -46,7 +54,7 @@ def phase_of(values: Any) -> Any:
 
 def picture(name: str, dt: float, loops: dict[str, StateSpace]) -> bytes:
     """Gain and phase of the loops, by the place where they are opened, and their sensitivity, as PNG."""
-    from cz_gym.evaluation.report.canvas import COLOURS, GREY, canvas, png
+    from cz_gym.evaluation.plots import COLOURS, GREY, canvas, png
 
     omega = frequencies(dt)
     figure = canvas(7.0, 6.5)

@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from cz_gym.agents import shipped_names, shipped_seeds
-from cz_gym.agents.agent_file.contract import Contract, read_agent
-from cz_gym.errors import CzError
-from cz_gym.evaluation.files import read_results
-from cz_gym.evaluation.report.tables import FAILURES, PULL_STEP, RMSE, Column
-from cz_gym.evaluation.report.tables import markdown as table
+from cz_gym.agents.contract import Contract, read_agent
 from cz_gym.evaluation.statistics import Estimate
-from cz_gym.support.atomic_files import check_writable, write_files
 from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.errors import CzError
+from cz_gym.support.files import check_writable, write_files
+from cz_gym.tools.files import read_results
+from cz_gym.tools.report.tables import FAILURES, PULL_STEP, RMSE, Column
+from cz_gym.tools.report.tables import markdown as table
 
 TOLD = (
     "its actions from the reward; a network that estimates the state from sensors was fitted to the true state, "

@@ -18,15 +18,14 @@ import numpy as np
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
-from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.machine.export.compiled import CompiledBlock
-from cz_gym.machine.export.controllers import make_block
-from cz_gym.machine.export.policy import BlockPolicy, Runner
-from cz_gym.machine.export.ports import in_shares
-from cz_gym.machine.export.shell import Block
-from cz_gym.support.atomic_files import check_writable, write_files
 from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.files import check_writable, write_files
+from cz_gym.tools.export.block import in_shares
+from cz_gym.tools.export.controllers import make_block
+from cz_gym.tools.export.shell import Block, BlockPolicy, Runner
+from cz_gym.tools.export.text import CompiledBlock
+from cz_gym.tools.report.tables import markdown
 
 CONTROLLERS = ("paper", "paper-tuned", "lqg-at-0.02", "gradient", "ppo")
 SCENARIOS = ("randomized", "hard", "sensor-fault", "puller")

@@ -1,7 +1,7 @@
 """Radius errors over the LQG's at equal pull activity: ``python -m studies.frontier benchmark.json``.
 
-The LQG's settings (:data:`cz_gym.baselines.tuning.lqg.FAMILY`) are the reference family of
-:mod:`cz_gym.evaluation.equal_activity`. With ``episodes.csv`` beside it, each ratio has a 95 % bootstrap interval.
+The LQG's settings (:data:`cz_gym.baselines.tuned_lqg.FAMILY`) are the reference family of
+:mod:`cz_gym.evaluation.statistics`. With ``episodes.csv`` beside it, each ratio has a 95 % bootstrap interval.
 """
 
 import argparse
@@ -14,15 +14,14 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
-from cz_gym.baselines.registry import CONTROLLERS
-from cz_gym.baselines.tuning.lqg import FAMILY
-from cz_gym.errors import CzError
-from cz_gym.evaluation.equal_activity import Point, frontier, intervals, ratios
-from cz_gym.evaluation.files import EPISODES, Episodes, read_episodes, read_results
-from cz_gym.evaluation.report.tables import markdown
-from cz_gym.evaluation.statistics import Estimate, Resamples
-from cz_gym.support.atomic_files import write_files
+from cz_gym.baselines.tuned_lqg import FAMILY
+from cz_gym.evaluation.statistics import Estimate, Point, Resamples, frontier, intervals, ratios
 from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.errors import CzError
+from cz_gym.support.files import write_files
+from cz_gym.tools.files import EPISODES, Episodes, read_episodes, read_results
+from cz_gym.tools.registry import CONTROLLERS
+from cz_gym.tools.report.tables import markdown
 
 ACTIVITY, RETURN = "pull_step_rms_mm_per_min", "return"
 RESAMPLES = 2_000

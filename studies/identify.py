@@ -17,25 +17,25 @@ from typing import NamedTuple
 import numpy as np
 
 from cz_gym import CzEnv, Parameters, make_puller
-from cz_gym.action import HEATER_RANGE
-from cz_gym.baselines.lqg.controller import LQG
-from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.tuning.lqg import FILTER, LQGS
-from cz_gym.baselines.tuning.pid import PIDS
+from cz_gym.baselines.lqg import LQG
+from cz_gym.baselines.pid import FilteredPID
+from cz_gym.baselines.tuned_lqg import FILTER, LQGS
+from cz_gym.baselines.tuned_pid import PIDS
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Pullers
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
-from cz_gym.evaluation.report.tables import markdown
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.machine.identify import Excited, Identified, identify, read_log, record_log
-from cz_gym.machine.identify.estimate import PRIOR_SD
-from cz_gym.machine.identify.moves import measure_excitation
-from cz_gym.machine.puller import PullerFile, read_puller, write_puller
-from cz_gym.support.atomic_files import check_writable, write_files
+from cz_gym.puller.file import PullerFile, read_puller, write_puller
+from cz_gym.spaces import HEATER_RANGE
 from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.files import check_writable, write_files
 from cz_gym.support.units import KILO, MM, PERCENT
+from cz_gym.tools.identify import Excited, Identified, identify, read_log, record_log
+from cz_gym.tools.identify.estimate import PRIOR_SD
+from cz_gym.tools.identify.moves import measure_excitation
+from cz_gym.tools.report.tables import markdown
 
 PULLERS, CRYSTALS = 20, 20
 """Number of pullers, and of crystals of each."""

@@ -13,18 +13,28 @@ from dataclasses import replace
 from pathlib import Path
 
 from cz_gym.agents import OnnxPolicy
-from cz_gym.baselines.registry import CONTROLLERS
-from cz_gym.errors import CzError
-from cz_gym.evaluation.contender import GROUPS, PLANT, REWARD, STATE, Contender, agent
-from cz_gym.evaluation.files import read_results, to_json
-from cz_gym.evaluation.protocol import CASES, TEST_SEEDS, Case, contract_hash
-from cz_gym.evaluation.report.markdown import summary
-from cz_gym.evaluation.report.tables import RMSE
-from cz_gym.evaluation.report.tables import markdown as table
+from cz_gym.evaluation.protocol import (
+    CASES,
+    GROUPS,
+    PLANT,
+    REWARD,
+    STATE,
+    TEST_SEEDS,
+    Case,
+    Contender,
+    agent,
+    contract_hash,
+)
 from cz_gym.evaluation.results import Result
-from cz_gym.evaluation.runner import check_agents, run
-from cz_gym.support.atomic_files import check_writable, naming, write_files
 from cz_gym.support.command_line import OneLineParser, between
+from cz_gym.support.errors import CzError
+from cz_gym.support.files import check_writable, naming, write_files
+from cz_gym.tools.files import read_results, to_json
+from cz_gym.tools.registry import CONTROLLERS
+from cz_gym.tools.report.markdown import summary
+from cz_gym.tools.report.tables import RMSE
+from cz_gym.tools.report.tables import markdown as table
+from cz_gym.tools.run import check_agents, run
 
 FRESH = range(3_000_000, 2**31)
 """Seeds that no training, validation or test uses."""

@@ -19,14 +19,12 @@ import gymnasium as gym
 import numpy as np
 
 from cz_gym.config import make_config
-from cz_gym.differentiable import DifferentiableBatch
-from cz_gym.engine.batch import Batch
-from cz_gym.env import CzEnv
-from cz_gym.evaluation.files import software
-from cz_gym.support.atomic_files import check_writable, write_files
+from cz_gym.engine.batch import Batch, processors
+from cz_gym.engine.tangents import DifferentiableBatch
+from cz_gym.env import CzEnv, CzVectorEnv
 from cz_gym.support.command_line import OneLineParser
-from cz_gym.support.processors import processors
-from cz_gym.vector import CzVectorEnv
+from cz_gym.support.files import check_writable, write_files
+from cz_gym.support.names import software
 
 QUICK, FULL = 3, 15
 """Rounds of a measurement."""

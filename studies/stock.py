@@ -16,14 +16,14 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from cz_gym.agents.from_sb3 import ALGORITHMS
-from cz_gym.agents.training.validation import JUDGING, validate
-from cz_gym.baselines.registry import make_controller
+from cz_gym.agents.validation import JUDGING, validate
 from cz_gym.config import make_config
-from cz_gym.errors import CzError
-from cz_gym.evaluation.report.tables import markdown
-from cz_gym.support.atomic_files import write_files
 from cz_gym.support.command_line import OneLineParser, between
+from cz_gym.support.errors import CzError
+from cz_gym.support.files import write_files
 from cz_gym.support.names import unknown
+from cz_gym.tools.registry import make_controller
+from cz_gym.tools.report.tables import markdown
 
 MILLION = 1_000_000
 SHORT = (MILLION // 4, MILLION // 2)

@@ -37,7 +37,7 @@ def pytest_sessionstart():
     """Of parallel workers one compiles what most tests need, kernels and large packages; the others then load it."""
     if "PYTEST_XDIST_WORKER" in os.environ and importlib.util.find_spec("filelock"):
         from cz_gym import CzEnv
-        from cz_gym.support.atomic_files import locked
+        from cz_gym.support.files import locked
 
         CACHE.mkdir(parents=True, exist_ok=True)
         with locked(CACHE, patience=3600.0):
@@ -96,7 +96,7 @@ def refused(capsys):
 @pytest.fixture
 def few_crystals(monkeypatch):
     """Training runs of this process pick and judge on two crystals each."""
-    from cz_gym.agents.training import validation
+    from cz_gym.agents import validation
     from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
     monkeypatch.setattr(validation, "PICKING", VALIDATION_SEEDS[:2])

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper
 
-from cz_gym.agents.agent_file.contract import facts_of
+from cz_gym.agents.contract import facts_of
 from cz_gym.config import make_config
 
 LINEAR = helper.make_node("Gemm", ["observation", "weight", "bias"], ["action"])
@@ -31,7 +31,7 @@ def model_of(nodes: list[Any], weights: dict[str, Any], channels: int, **changes
 
 
 def facts(observation: str = "history", **changes: Any) -> dict[str, Any]:
-    """Arguments of :func:`cz_gym.agents.agent_file.contract.make_contract` for an agent trained on "randomized"."""
+    """Arguments of :func:`cz_gym.agents.contract.make_contract` for an agent trained on "randomized"."""
     config = make_config(observation=observation)
     known = {
         **facts_of(config),

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from cz_gym.episodes.series import draw_episode, new_series
+from cz_gym.episodes.draw import episode_from_key, new_series
 
 
 class Truth(NamedTuple):
@@ -56,7 +56,7 @@ def drawn(env: Any) -> Any:
     """The random series of a scalar environment's episode, drawn from its key as a whole."""
     config = env.config
     series = new_series(int(config.horizon // 5.0) + 2, config.steps + 1)
-    draw_episode(config.sole_scenario, tuple(env.get_state().slot.slot["key"].tolist()), series)
+    episode_from_key(config.sole_scenario, tuple(env.get_state().slot.slot["key"].tolist()), series)
     return series
 
 

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from cz_gym import CzVectorEnv
-from cz_gym.observation import MEASURED, PULL_SCALE, scales
+from cz_gym.process import PULL_SCALE, scales
+from cz_gym.spaces import MEASURED
 
 PLAIN: dict[str, Any] = {"observation": "measured", "action": "direct"}
 """Settings of an environment for classical controllers."""

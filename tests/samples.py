@@ -4,13 +4,12 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
-from cz_gym.baselines.lqg.controller import LQG, LQGDesign
-from cz_gym.baselines.registry import find_controller
-from cz_gym.baselines.tuning.values import with_values
-from cz_gym.evaluation.contender import Contender
-from cz_gym.evaluation.protocol import find_case
+from cz_gym.baselines.lqg import LQG, LQGDesign
+from cz_gym.baselines.tuned import with_values
+from cz_gym.evaluation.protocol import Contender, find_case
 from cz_gym.evaluation.results import Result, Sample, summarise
 from cz_gym.evaluation.rollout import Rollout, rollout
+from cz_gym.tools.registry import find_controller
 
 NOMINAL_LQG = LQG(
     design=with_values(

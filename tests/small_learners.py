@@ -2,11 +2,10 @@
 
 from typing import Any
 
+from cz_gym.agents import train, validation
 from cz_gym.agents.asymmetric import LearnState
-from cz_gym.agents.training import fleet, validation
-from cz_gym.agents.training.algorithms import make_algorithm, repeat_of
-from cz_gym.agents.training.recipes import APG, PPO, SAC, Recipe
-from cz_gym.agents.training.run import Job
+from cz_gym.agents.recipes import APG, PPO, SAC, Recipe, make_algorithm, repeat_of
+from cz_gym.agents.train import Job
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
 SMALL = PPO(num_envs=4, action_repeat=2, hidden=(16, 16), steps=128, n_steps=16, batch_size=32, n_epochs=1)
@@ -17,7 +16,7 @@ SMALL_APG = APG(num_envs=4, window=20, steps=160)
 QUICK = PPO(num_envs=64, action_repeat=2, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,), fewest_updates=1)
 """For runs of ``train.py``."""
 REFERENCES = dict.fromkeys(validation.REFERENCES["Cz-v0"], (0.2, 0.1))
-TRAIN_SEED = fleet.train_seed
+TRAIN_SEED = train.train_seed
 
 
 def train_small_seed(job: Job, bar: Any = None) -> dict[str, float]:

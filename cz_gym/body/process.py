@@ -5,16 +5,30 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.episodes.draw import randomised
-from cz_gym.episodes.schedule import bias_offset, melt_left, reference
-from cz_gym.jit.compile import force_inlined, jittable, labelled
-from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.jit import force_inlined, jittable, labelled
+from cz_gym.physics import plant
+from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.physics.numerics import StateSpace
+from cz_gym.physics.numerics import linearise as linearise_process
 from cz_gym.physics.parameters import Parameters, check_parameters
+from cz_gym.physics.plant import (
+    HEIGHT_MAX_IN_A,
+    HEIGHT_MIN,
+    NO_DISTURBANCE,
+    RADIUS_LIMIT,
+    Disturbance,
+    Puller,
+    State,
+    check_height,
+    growth,
+    within_limits,
+)
+from cz_gym.physics.schedule import bias_offset, melt_left, reference
 from cz_gym.process import GROWS, LOST, Inputs, Process, Seen
 from cz_gym.support.units import MM
 
-from . import cost, plant, signals
-from .plant import Disturbance, Puller, State, growth
-from .task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT, check_height, within_limits
+from . import signals
+from . import signals as cost
 
 _LOW = 5.0 * MM
 """Above this height no melt can freeze the meniscus within half a substep [m]."""
@@ -25,7 +39,7 @@ class Extra(NamedTuple):
     """Numbers besides the state that outlive a step."""
 
     v_p_mean: Any
-    """Exponential mean of the applied pull speed over :data:`cz_gym.body.cost.PULL_MEMORY` [m/s]."""
+    """Exponential mean of the applied pull speed over :data:`cz_gym.body.signals.PULL_MEMORY` [m/s]."""
 
 
 def check(parameters: Parameters, meniscus: MeniscusModel) -> Parameters:
@@ -186,3 +200,74 @@ BODY = Process(
     carry=carry,
     name="Cz-v0",
 )
+
+
+# The body's plant as control engineers write it: its state space, and G_p and G_m of the growth dynamics.
+
+STATES = State._fields
+"""Rows and columns of A."""
+LOADS = ("Q_d", "dT_i")
+INPUTS = (*Inputs._fields, *LOADS)
+"""Columns of B and D: both inputs, then both disturbances."""
+OUTPUTS = ("r_c", "r_br", "v_g", "alpha_c")
+"""Rows of C and D."""
+
+
+class RadiusModel(NamedTuple):
+    """Pull speed to bright ring at constant melt temperature, as a series of two transfer functions.
+
+    G_p(s) = numerator / ((s - poles[0]) (s - poles[1])) from v_p to r_c, G_m(s) = lead s + constant from r_c to r_br.
+    """
+
+    numerator: float
+    """Gain of G_p [1/s]."""
+    poles: tuple[float, float]
+    """Poles of G_p, that of the cone angle first, then that of the meniscus height [rad/s]."""
+    lead: float
+    """Coefficient of s in G_m [s]."""
+    constant: float
+    """Static gain of G_m [-]."""
+
+    @property
+    def zero(self) -> float:
+        """Zero of G_m [rad/s]; in the right half plane it is the inverse response."""
+        return -self.constant / self.lead
+
+
+def linearise(
+    puller: Puller,
+    meniscus: MeniscusModel = HURLE,
+    x: State | None = None,
+    u: Inputs | None = None,
+    d: Disturbance = NO_DISTURBANCE,
+) -> StateSpace:
+    """Linearise the plant and its bright ring at a state, by default the operating point.
+
+    States :data:`STATES`, inputs :data:`INPUTS`, outputs :data:`OUTPUTS`.
+    """
+
+    def seen(x: Any, u: Any, d: Any) -> Any:
+        at_interface = growth(x, d, puller, meniscus.slope)
+        ring = x.r_c + meniscus.ring_offset(x.r_c, x.h_c, puller)
+        return x.r_c, ring, at_interface.v_g, np.arctan(at_interface.tan_alpha)
+
+    at = x or puller.state_0, u or puller.inputs_0, d
+    return linearise_process(BODY, puller, meniscus, at, LOADS, seen)
+
+
+def radius_model(puller: Puller, meniscus: MeniscusModel = HURLE) -> RadiusModel:
+    """G_p and G_m at the operating point, melt temperature held (Part II, section on the linearised model).
+
+    With r_c' = A_rr r_c + A_rh h_c and h_c' = A_hh h_c + v_p (the height does not feel the radius), G_p's numerator is
+    A_rh and its poles are A_rr and A_hh; eliminating h_c from r_br = C_r r_c + C_h h_c gives G_m.
+    """
+    A, B, C, _ = linearise(puller, meniscus)
+    r, h = STATES.index("r_c"), STATES.index("h_c")
+    C_r, C_h = C[OUTPUTS.index("r_br"), [r, h]]
+    lead = C_h / A[r, h]
+    return RadiusModel(
+        numerator=float(A[r, h] * B[h, INPUTS.index("v_p")]),
+        poles=(float(A[r, r]), float(A[h, h])),
+        lead=float(lead),
+        constant=float(C_r - lead * A[r, r]),
+    )

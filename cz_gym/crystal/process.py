@@ -7,25 +7,25 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.body import cost
-from cz_gym.body.plant import hidden_load
+from cz_gym.body import signals as cost
 from cz_gym.body.process import BODY
-from cz_gym.body.task import HEIGHT_MAX_IN_A
-from cz_gym.episodes.record import Episode, Factors, Stream
+from cz_gym.episodes.draw import Episode, Factors, Stream
 from cz_gym.episodes.rng import normal
-from cz_gym.episodes.scenario import DRAW_SPAN
-from cz_gym.episodes.schedule import bias_offset
-from cz_gym.errors import CzError
-from cz_gym.jit.compile import jittable
+from cz_gym.jit import jittable
 from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.physics.numerics import linearise
 from cz_gym.physics.parameters import check_parameters
+from cz_gym.physics.plant import HEIGHT_MAX_IN_A, hidden_load
+from cz_gym.physics.schedule import DRAW_SPAN, bias_offset
 from cz_gym.process import NO_OPERATING_POINT, Inputs, Process, Seen
+from cz_gym.support.errors import CzError
 from cz_gym.support.units import KILO, MM
 
-from . import plant, recipe, signals, task
-from .parameters import APART, STAGES, check_shape, complete, parts
-from .plant import Disturbance, State, at_interface
-from .shape import growth_rate, shape_at
+from . import plant, recipe, signals
+from . import recipe as task
+from .plant import APART, NO_DISTURBANCE, STAGES, Disturbance, State, at_interface, check_shape, complete, parts, rates
+from .recipe import end, growth_rate, shape_at
+from .signals import weight
 
 SLACK = 1.3
 """Time that an episode may last, in multiples of the recipe's [-]."""
@@ -37,7 +37,7 @@ class Extra(NamedTuple):
     """Numbers besides the state that outlive a step."""
 
     v_p_mean: Any
-    """Exponential mean of the pull speed minus the recipe's over :data:`cz_gym.body.cost.PULL_MEMORY` [m/s]."""
+    """Exponential mean of the pull speed minus the recipe's over :data:`cz_gym.body.signals.PULL_MEMORY` [m/s]."""
     stop: Any
     """Length at which the episode ends with success [m]."""
     load_cell: Any
@@ -231,3 +231,74 @@ CRYSTAL = Process(
 )
 ENVIRONMENTS = {each.name: each for each in (BODY, CRYSTAL)}
 """The processes by the names of their environments."""
+
+
+# The crystal's plant along its recipe as control engineers write it: deviations from the recipe at each length.
+#
+# The references run with the length, so a deviation is that from the recipe at the length that has been reached. With
+# L as clock, x' = f(x, u) and L' = v_g(x), it moves by A = df/dx - (f / v_g) dv_g/dx at the recipe, and so does B.
+
+STATES = (*State._fields[:5], "M_s")
+"""Rows and columns of A: what changes within minutes, and the mass, which a load cell weighs; area and dopant are the
+recipe's."""
+_ROWS = [State._fields.index(name) for name in STATES]
+INPUTS = (*Inputs._fields, "Q_d", "dT_i")
+"""Columns of B."""
+_POINTS = 256
+
+
+class Along(NamedTuple):
+    """The linearisation at lengths L [m], each of shape (points, ...)."""
+
+    L: Floats
+    A: Floats
+    """Shape (points, 6, 6)."""
+    B: Floats
+    """Shape (points, 6, 4)."""
+    C: Floats
+    """The bright ring [m] and the load cell [N] by the states, shape (points, 2, 6)."""
+    load: float
+    """Heat load on the melt that comes with a kelvin of drift, which the recipe that is given follows [W/K]."""
+
+    @property
+    def a_h(self) -> Floats:
+        """Rate with which the height's deviation dies out [rad/s]."""
+        return -self.A[:, 1, 1]
+
+    @property
+    def c_h(self) -> Floats:
+        """The ring by the height [-]."""
+        return self.C[:, 0, 1]
+
+    @property
+    def zero(self) -> Floats:
+        """Zero from pull speed to ring at constant temperature [rad/s]: the inverse response where it is positive."""
+        rate: Floats = self.A[:, 0, 0] - self.C[:, 0, 0] * self.A[:, 0, 1] / self.c_h
+        return rate
+
+
+@lru_cache(maxsize=16)
+def along(parameters: Any, meniscus: MeniscusModel, lam: float = 1.0) -> Along:
+    """Linearise the design puller along its recipe, with this share of conduction [-]."""
+    p, table = nominal_recipe(parameters._replace(**dict.fromkeys(APART, 0.0)), meniscus, lam)
+    lengths = np.linspace(0.0, end(p), _POINTS)
+    points = [_at(float(L), table, p, meniscus) for L in lengths]
+    load = float(hidden_load(0.5, p) - hidden_load(-0.5, p))
+    A, B, C = (np.stack(each) for each in zip(*points, strict=True))
+    return Along(lengths, A, B, C, load)
+
+
+def _at(L: float, table: Floats, p: Any, m: MeniscusModel) -> tuple[Floats, Floats, Floats]:
+    """A, B and C at a length."""
+    row, share = recipe.place(L, p)
+    x = State(*map(float, recipe.state_at(L, table, p, Episode())))
+    u = Inputs(*(float(recipe.look_up(table, row, share, at)) for at in (recipe._v_p, recipe._Q_H)))
+
+    def seen(x: Any, u: Any, d: Any) -> Any:
+        return x.r_c + m.ring_offset(x.r_c, x.h_c, p), weight(x, 0.0, p)
+
+    model = linearise(CRYSTAL, p, m, (x, u, NO_DISTURBANCE), INPUTS[2:], seen)
+    moves, length = np.array(rates(x, u, NO_DISTURBANCE, p, m)), State._fields.index("L")
+    drift = moves / moves[length]
+    A, B = model.A - np.outer(drift, model.A[length]), model.B - np.outer(drift, model.B[length])
+    return A[np.ix_(_ROWS, _ROWS)], B[_ROWS], model.C[:, _ROWS]

@@ -9,20 +9,18 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.body.cost import outside
 from cz_gym.body.signals import PAST as PAST
-from cz_gym.episodes.schedule import bias_offset, drift
-from cz_gym.jit.compile import jittable
+from cz_gym.body.signals import outside
+from cz_gym.jit import jittable
 from cz_gym.physics.meniscus import hurle_slope
+from cz_gym.physics.schedule import bias_offset, drift
 from cz_gym.process import DONE, HEATER_SCALE, PULL_SCALE, Relative, signals
 from cz_gym.process import Channel as Channel
 from cz_gym.support.units import KILO, MINUTE, MM
 
 from . import recipe
 from .plant import meniscus_mass
-from .recipe import value
-from .shape import shape_at
-from .task import end, height_inside
+from .recipe import end, height_inside, shape_at, value
 
 NEAR, FAR = 5.0 * MM, 25.0 * MM
 """Lengths ahead for which the recipe is observed [m]."""

@@ -1,7 +1,4 @@
-"""A batch of slots: the arrays, the draws at reset and the compiled step, on several threads if large.
-
-The scalar environment is a batch of one; both environments are thin shells over this class.
-"""
+"""The number of processors that a process may use."""
 
 import math
 import os
@@ -16,24 +13,33 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import seeding
 
-from cz_gym.action import drives_of
 from cz_gym.camera.image import build_look
 from cz_gym.camera.view import IMAGE, make_view
 from cz_gym.config import Config, Identity
-from cz_gym.episodes.log_series import series_table
-from cz_gym.episodes.mixture import Distribution
-from cz_gym.episodes.record import ScenarioTable, scenario_table
-from cz_gym.episodes.scenario import GRID
-from cz_gym.errors import CzError
-from cz_gym.jit.compile import entry
-from cz_gym.machine.adapt import adapt_scenario
-from cz_gym.observation import lags, observations
+from cz_gym.episodes.adapt import adapt_scenario
+from cz_gym.episodes.draw import ScenarioTable, scenario_table
+from cz_gym.episodes.scenario import GRID, Distribution, series_table
+from cz_gym.jit import entry
 from cz_gym.physics.quantities import MAX_DEAD_TIME, MAX_LATENCY
 from cz_gym.process import NO_OPERATING_POINT, scales
+from cz_gym.spaces import drives_of, lags, observations
+from cz_gym.support.errors import CzError
 
-from .buffers import BufferPool
 from .kernels import build_kernels
-from .layout import Fixed, ObservationScales, Out, SlotMemory, info_width, slot_type
+from .slots import BufferPool, Fixed, ObservationScales, Out, SlotMemory, info_width, slot_type
+
+
+def processors() -> int:
+    """Return how many processors this process may use; taskset or a container may allow fewer than the machine has."""
+    counts: Any = os  # Python 3.13 has the one, Linux the other
+    if hasattr(counts, "process_cpu_count"):
+        return counts.process_cpu_count() or 1
+    return len(counts.sched_getaffinity(0)) if hasattr(counts, "sched_getaffinity") else os.cpu_count() or 1
+
+
+# A batch of slots: the arrays, the draws at reset and the compiled step, on several threads if large.
+#
+# The scalar environment is a batch of one; both environments are thin shells over this class.
 
 SLOTS_PER_THREAD, SLOTS_AT_ONCE = 256, 128
 """Least slots per thread in a step, and slots that a thread takes at once."""

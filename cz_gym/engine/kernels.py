@@ -1,27 +1,80 @@
-"""The compiled loops: draws, drives, plant, sensors, observation and reward, for one slot or ten thousand.
-
-The equations are the functions of a :class:`cz_gym.process.Process`, compiled in; this module calls them in order for
-each slot.
-"""
+"""Output of a slot's signals: scaled channels, the memory of "history", the rows of ``info``."""
 
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.episodes.draw import draw_episode, draw_factors, draw_scenario, seed_streams
-from cz_gym.episodes.noise import first_fluctuation, fluctuation, sample_noise
-from cz_gym.jit.cache import hashed
-from cz_gym.jit.compile import fetch, inlined, jittable, kernel, labelled, set_labelled
-from cz_gym.physics.arithmetic import along
+from cz_gym.episodes.draw import (
+    draw_episode,
+    draw_factors,
+    draw_scenario,
+    first_fluctuation,
+    fluctuation,
+    sample_noise,
+    seed_streams,
+)
+from cz_gym.jit import fetch, hashed, inlined, jittable, kernel, labelled, scratch, set_labelled
 from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.physics.numerics import along, clip
 from cz_gym.process import GROWS, LOST, Inputs, Process, Readings
+from cz_gym.spaces import CLIP, INTEGRAL_SCALE
 
-from .drives import drive
-from .layout import model_of
-from .lockstep import LANES, advance
-from .outputs import recall, remember, write_channels
-from .sensors import sense
+from .loop import LANES, advance, drive, sense
+from .slots import model_of
+
+
+@jittable
+def write_channels(values: Any, per_scale: Any, out: Any) -> None:
+    """Write signals scaled and clipped, as "measured" or "state" channels."""
+    for channel in range(len(values)):
+        out[channel] = clip(values[channel] * per_scale[channel], CLIP)
+
+
+@jittable
+def remember(slot: Any, history: Any, interval: Any, out: Any, process: Any) -> None:
+    """Add the sample's scaled channels to the running sums, and the first of them, the error, to its integral."""
+    depth, error = history.shape[0], process.remembered[0]
+    if slot.k == 0:
+        for back in range(depth):
+            history[depth - 1 - back, 0] = -out[error] * back
+            for channel in range(1, len(process.remembered)):
+                history[depth - 1 - back, channel] = 0.0
+    else:
+        step = out[error] * (process.integrated_scale / INTEGRAL_SCALE) * interval
+        slot.integral = clip(slot.integral + step, CLIP)
+    at = slot.k % depth
+    before = at - 1 if at > 0 else depth - 1
+    for channel in range(len(process.remembered)):
+        history[at, channel] = history[before, channel] + out[process.remembered[channel]]
+
+
+@jittable
+def recall(slot: Any, measured: Any, history: Any, scales: Any, out: Any, process: Any) -> None:
+    """Turn "measured" channels into "history": integral, differences of successive spans' means, relative channels."""
+    depth, first, signals = history.shape[0], len(measured), process.lagged
+    later, at = scratch(1, process.lagged), slot.k % depth
+    out[first] = slot.integral
+    for channel in range(signals):
+        later[0, channel] = history[at, channel] - history[at - 1 if at > 0 else depth - 1, channel]
+    for lag in range(scales.newest.size):
+        newest, before = at - scales.newest[lag], at - scales.before[lag]
+        newest, before = newest if newest >= 0 else newest + depth, before if before >= 0 else before + depth
+        for channel in range(signals):
+            mean = (history[newest, channel] - history[before, channel]) * scales.share[lag]
+            change = process.past_change[channel]
+            out[first + 1 + lag * signals + channel] = clip((mean - later[0, channel]) * change, CLIP)
+            later[0, channel] = mean
+    for row in range(len(process.relative_at)):
+        place, to = process.relative_at[row], process.relative_to[row]
+        difference = measured[place] - measured[to]
+        out[place] = clip(difference * (scales.measured[place] * process.relative_change[row]), CLIP)
+
+
+# The compiled loops: draws, drives, plant, sensors, observation and reward, for one slot or ten thousand.
+#
+# The equations are the functions of a :class:`cz_gym.process.Process`, compiled in; this module calls them in order
+# for each slot.
 
 TRIES = 100
 """Largest number of draws of a puller, all from one stream, until one has an operating point."""

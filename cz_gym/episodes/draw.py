@@ -1,21 +1,167 @@
-"""The draw of an episode, compiled: streams from one key, then the puller, ramps, constants and freezes.
-
-Each stream is seeded with its own number (:func:`.record.stream_number`), so that families never share a random number.
-Scalars come first on each stream, and the noise of each step after them (:mod:`cz_gym.episodes.noise`), so a longer
-horizon extends a draw and never changes it.
-"""
+"""A scenario as one record for the compiled draws, and the constants of a drawn episode."""
 
 import math
-from typing import Any
+from enum import IntEnum
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from cz_gym.jit.compile import jittable
+from cz_gym.jit import jittable, kernel
 from cz_gym.physics.parameters import Parameters
+from cz_gym.physics.quantities import Range
+from cz_gym.physics.schedule import DRAW_SPAN
 
-from .record import FREEZES, MIXTURE_STREAM, Episode, Factors, Stream, stream_number
-from .rng import WORDS, normal, seed_stream, uniform
-from .scenario import DRAW_SPAN, GRID, MAX_FLAGGED
+from .rng import WORDS, normal, seed_stream, two_normals, uniform
+from .scenario import FAMILIES, GRID, MAX_FLAGGED, MAX_UNFLAGGED, Distribution, Scenario
+from .scenarios import mix_of
+
+FREEZES = MAX_FLAGGED + MAX_UNFLAGGED
+"""Freeze windows an episode can hold; the last is the unflagged one."""
+
+
+FIRST_FRAME = 8
+"""Number of the random stream from which the camera's first frame draws its shot noise; frame k draws from
+FIRST_FRAME + k. Written into every image: it stays, however many members :class:`Stream` has."""
+MOST_FRAMES = 2**31
+"""Streams that are reserved for frames."""
+MIXTURE_STREAM = 2**32 - 1
+"""Number of the random stream from which a mixture's episode draws its scenario: the last one there is."""
+
+
+class Stream(IntEnum):
+    """The independent random streams of an episode; a new one goes last."""
+
+    START = 0
+    PARAMETERS = 1
+    SCHEDULE = 2
+    INTERFACE = 3
+    SENSOR = 4
+    FAULTS = 5
+    DROPOUTS = 6
+    OUTLIERS = 7
+
+
+def stream_number(index: int) -> int:
+    """Number n of an episode's stream, ``SeedSequence(key, spawn_key=(n,))``: its index, beyond the frames' numbers."""
+    return index if index < FIRST_FRAME else MOST_FRAMES + index
+
+
+class Episode(NamedTuple):
+    """The constants of a drawn episode, floats in SI units.
+
+    A field with the name of a scenario's member is that number, or the number drawn from its range.
+    """
+
+    r_c_start: float = 0.0
+    """r_c(0) - r_0 [m]."""
+    recipe_start: float = 0.0
+    recipe_duration: float = 1.0
+    recipe_amount: float = 0.0
+    """Ramp of the recipe's error: start [s], duration [s], final value [K]."""
+    drift_start: float = 0.0
+    drift_duration: float = 1.0
+    drift_amount: float = 0.0
+    """Ramp of the hot zone's drift: start [s], duration [s], final value [K]."""
+    drift_rate: float = 0.0
+    """Steady rate of the hot zone's drift, on top of the ramp [K/s]."""
+    reference_start: float = 0.0
+    reference_duration: float = 1.0
+    reference_amount: float = 0.0
+    """Change of the reference: start [s], duration [s], size [m]."""
+    melt_loss: float = 0.0
+    ring_offset: float = 0.0
+    """Constant offset of the ring, from bias and melt level [m]."""
+    bias_drift_start: float = 0.0
+    bias_drift_duration: float = 1.0
+    bias_drift_amount: float = 0.0
+    """Ramp of the ring's drift: start [s], duration [s], final value [m]."""
+    ripple_amplitude: float = 0.0
+    ripple_omega: float = 0.0
+    ripple_phase: float = 0.0
+    """Ripple of the ring: amplitude [m], angular frequency [rad/s], phase at t = 0 [rad]."""
+    pyrometer_drift: float = 0.0
+    latency: float = 0.0
+    pull_window: float = math.inf
+    pull_slew: float = math.inf
+    heater_slew: float = math.inf
+    heater_step: float = 0.0
+    sd_fast: float = 0.0
+    sd_slow: float = 0.0
+    """Standard deviations of the interface's fast and slow fluctuation [K]."""
+    keep_fast: float = 0.0
+    keep_slow: float = 0.0
+    """Factors of the two fluctuations over one interval of the grid [-]."""
+    kick_fast: float = 0.0
+    kick_slow: float = 0.0
+    """Standard deviations of the two fluctuations' new parts, sqrt(1 - keep^2) [-]."""
+    camera_sd: float = 0.0
+    """Standard deviation of the ring's white noise [m]."""
+    pyrometer_sd: float = 0.0
+    """Standard deviation of the pyrometer's white noise [K]."""
+    dropout: float = 0.0
+    outlier_probability: float = 0.0
+    outlier_sd: float = 0.0
+    heater_lag: float = 0.0
+    heater_dead_time: float = 0.0
+    pyrometer_filter: float = 0.0
+
+
+class Factors(NamedTuple):
+    """A puller's factors on its design parameters, and its mix of models."""
+
+    lam: float = 1.0
+    a: float = 1.0
+    k_l: float = 1.0
+    kappa_12: float = 1.0
+    G_1a: float = 1.0
+    G_2b: float = 1.0
+    kappa_b: float = 1.0
+    C_1: float = 1.0
+    C_2: float = 1.0
+    C_b: float = 1.0
+
+
+RECORD = np.dtype(
+    [
+        (family, [(name, np.float64, np.shape(value)) for name, value in vars(kind()).items()])
+        for family, kind in FAMILIES.items()
+    ]
+)
+"""A scenario as a record for the compiled draws: families of numbers and pairs."""
+
+
+class ScenarioTable(NamedTuple):
+    """Scenarios as read-only arrays for the compiled draws, one row a scenario."""
+
+    records: npt.NDArray[Any]
+    """The scenarios' numbers: records of :data:`RECORD`."""
+    mixes: npt.NDArray[np.float64]
+    """Range of the share of conduction [-], shape (scenarios, 2)."""
+    cumulative_share: npt.NDArray[np.float64]
+    """Running sums of the scenarios' shares [-]."""
+
+
+@lru_cache(maxsize=64)
+def scenario_table(distribution: Distribution, model: str | float | None = None) -> ScenarioTable:
+    """The numbers of a scenario, or of each scenario of a mixture, under the environment's ``model`` argument."""
+    records = np.zeros(len(distribution.scenarios), RECORD)
+    for row, scenario in enumerate(distribution.scenarios):
+        for family, each, value in scenario.members:
+            records[family][each.name][row] = value
+    mixes = np.array([mix_of(model, scenario) for scenario in distribution.scenarios], np.float64)
+    table = ScenarioTable(records, mixes, np.cumsum(distribution.shares))
+    for array in table:
+        array.setflags(write=False)
+    return table
+
+
+# The draw of an episode, compiled: streams from one key, then the puller, ramps, constants and freezes.
+#
+# Each stream is seeded with its own number (:func:`.record.stream_number`), so that families never share a random
+# number. Scalars come first on each stream, and the noise of each step after them (:mod:`cz_gym.episodes.draw`), so a
+# longer horizon extends a draw and never changes it.
 
 STREAMS = len(Stream)
 _NUMBERS = tuple(map(stream_number, range(STREAMS)))
@@ -196,3 +342,106 @@ def _place_freezes(lengths: Any, order: Any, share: Any, freezes: Any) -> None:
                     start = passed + share[candidate] * room
             freezes[which, 0] = start
             freezes[which, 1] = start + lengths[which]
+
+
+# The random numbers of every step: interface fluctuation, sensor noise, drop-outs and outliers.
+#
+# ``streams`` are the episode's (:mod:`cz_gym.episodes.rng`), ``e`` its :class:`cz_gym.episodes.draw.Episode`. Each
+# kind is drawn in order of time from a stream of its own, so it depends on the episode's key alone, whether drawn step
+# by step or as a whole series.
+
+_DROPOUTS, _OUTLIERS = int(Stream.DROPOUTS), int(Stream.OUTLIERS)
+
+
+@jittable
+def first_fluctuation(e: Any, streams: Any) -> Any:
+    """The interface's two stationary processes at t = 0 [standard deviations]."""
+    return two_normals(streams[_INTERFACE]) if e.sd_fast > 0.0 or e.sd_slow > 0.0 else (0.0, 0.0)
+
+
+@jittable
+def next_fluctuation(e: Any, streams: Any, fast: Any, slow: Any) -> Any:
+    """The two processes at the next grid point, discretised exactly: x <- keep x + sqrt(1 - keep^2) n."""
+    first, second = two_normals(streams[_INTERFACE]) if e.sd_fast > 0.0 or e.sd_slow > 0.0 else (0.0, 0.0)
+    return e.keep_fast * fast + e.kick_fast * first, e.keep_slow * slow + e.kick_slow * second
+
+
+@jittable
+def fluctuation(e: Any, fast: Any, slow: Any) -> Any:
+    """dT_i [K] of the two processes."""
+    return e.sd_fast * fast + e.sd_slow * slow
+
+
+@jittable
+def sample_noise(e: Any, streams: Any) -> Any:
+    """Camera [m] and pyrometer [K] noise of the next sample; a camera's NaN is a drop-out."""
+    noisy = e.camera_sd > 0.0 or e.pyrometer_sd > 0.0
+    camera, pyrometer = two_normals(streams[_SENSOR]) if noisy else (0.0, 0.0)
+    camera, pyrometer = e.camera_sd * camera, e.pyrometer_sd * pyrometer
+    if e.outlier_probability > 0.0 and uniform(streams[_OUTLIERS]) < e.outlier_probability:
+        camera += e.outlier_sd * normal(streams[_OUTLIERS])
+    if e.dropout > 0.0 and uniform(streams[_DROPOUTS]) < e.dropout:
+        camera = np.nan
+    return camera, pyrometer
+
+
+@jittable
+def draw_series(e: Any, streams: Any, interface: Any, noise: Any) -> None:
+    """Write dT_i [K] on the grid, shape (points,), and the noise of each sample, shape (samples, 2)."""
+    fast, slow = first_fluctuation(e, streams)
+    for j in range(interface.size):
+        interface[j] = fluctuation(e, fast, slow)
+        fast, slow = next_fluctuation(e, streams, fast, slow)
+    for k in range(noise.shape[0]):
+        noise[k, 0], noise[k, 1] = sample_noise(e, streams)
+
+
+# An episode's draw: a value made at reset from one 128-bit key, and the series that follow from it.
+#
+# Ramps are kept as parameters and evaluated where needed (:mod:`cz_gym.physics.schedule`). The noise of each step
+# comes from the episode's own streams (:mod:`cz_gym.episodes.draw`): the environment draws it step by step, this
+# module as whole series.
+
+Floats = npt.NDArray[np.float64]
+
+
+class Series(NamedTuple):
+    """The random series of an episode."""
+
+    interface: Floats
+    """dT_i on the 5 s grid [K], shape (grid points,)."""
+    noise: Floats
+    """Camera noise [m] (NaN: the sample drops out) and pyrometer noise [K], shape (samples, 2)."""
+    freezes: Floats
+    """Start and end of each camera freeze [s], shape (FREEZES, 2); the last is unflagged, end 0 is none."""
+
+
+def new_series(grid_points: int, samples: int) -> Series:
+    """Series of zeros."""
+    return Series(np.zeros(grid_points), np.zeros((samples, 2)), np.zeros((FREEZES, 2)))
+
+
+def factors_from_key(scenario: Scenario, mix: Range, key: tuple[int, int]) -> Factors:
+    """Draw the puller; ``mix`` is the range of the share of conduction [-]."""
+    return Factors(*_factors(scenario_table(scenario).records, np.array(mix, np.float64), np.array(key, np.uint64)))
+
+
+def episode_from_key(scenario: Scenario, key: tuple[int, int], out: Series) -> Episode:
+    """Draw an episode: ramps and constants are returned, series written into ``out``."""
+    return Episode(*_episode(scenario_table(scenario).records, np.array(key, np.uint64), *out))
+
+
+@kernel
+def _factors(record: Any, mix: Any, key: Any) -> Any:
+    streams = np.zeros((STREAMS, WORDS), np.uint64)
+    seed_streams(streams, key)
+    return draw_factors(record[0], mix, streams)
+
+
+@kernel
+def _episode(record: Any, key: Any, interface: Any, noise: Any, freezes: Any) -> Any:
+    streams = np.zeros((STREAMS, WORDS), np.uint64)
+    seed_streams(streams, key)
+    e = draw_episode(record[0], streams, freezes)
+    draw_series(e, streams, interface, noise)
+    return e

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numba.np.random._constants import fi_double, ki_double, wi_double, ziggurat_nor_inv_r, ziggurat_nor_r
 
-from cz_gym.jit.compile import jittable
+from cz_gym.jit import jittable
 
 WORDS = 4
 """64-bit words of a stream."""

@@ -5,27 +5,29 @@ left at its default is absent. Two scenarios with equal contents have equal :att
 number is its :class:`cz_gym.physics.quantities.Quantity`'s; what belongs to the machine is in its table.
 """
 
+import csv
 import dataclasses
 import hashlib
 import json
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from numbers import Real
+from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+import numpy.typing as npt
 
-from cz_gym.errors import CzError
-from cz_gym.physics.quantities import MACHINE, Quantity
-from cz_gym.support.units import HOUR
+from cz_gym.physics.quantities import MACHINE, Quantity, Range
+from cz_gym.physics.schedule import DRAW_SPAN
+from cz_gym.support.errors import CzError
 
-Range = tuple[float, float]
 NONE: Range = (0.0, 0.0)
 ONE: Range = (1.0, 1.0)
 GRID = 5.0
 """Interval [s] of the grid on which physical fluctuations live; held in between."""
-DRAW_SPAN = 3.0 * HOUR
-"""Span [s] over which "uniform over the episode" is drawn, whatever the horizon: a draw never depends on it."""
 MAX_FLAGGED, MAX_UNFLAGGED = 3, 1
 """Most freezes of each kind in an episode."""
 _SECONDS = "s", 0.0, 1e6
@@ -203,7 +205,7 @@ class Scenario:
     actuators: Actuators = field(default_factory=Actuators)
     series: tuple[tuple[float, float], ...] = ()
     """Heat load on the melt [W] and fluctuation of the interface [K] on the 5 s grid, in place of drawn ones; the last
-    values stay (:mod:`cz_gym.episodes.log_series`)."""
+    values stay (:mod:`cz_gym.episodes.scenario`)."""
 
     def __post_init__(self) -> None:
         if not (self.name and isinstance(self.name, str)):
@@ -221,7 +223,7 @@ class Scenario:
 
     @property
     def scenarios(self) -> tuple[Self, ...]:
-        """The scenario itself: a mixture has several (:class:`cz_gym.episodes.mixture.Mixture`)."""
+        """The scenario itself: a mixture has several (:class:`cz_gym.episodes.scenario.Mixture`)."""
         return (self,)
 
     @property
@@ -290,3 +292,118 @@ def _plain(default: Any, value: Any) -> Any:
     if isinstance(default, tuple):
         return [_plain(default[0], part) for part in value]
     return int(value) if isinstance(default, int) else float(value) + 0.0
+
+
+# Several scenarios at once: each episode is drawn from one of them.
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Scenarios with their shares of the episodes; frozen, comparable, hashed.
+
+    An episode's scenario follows from its key, on a random stream of its own: it is bit for bit the episode that the
+    same seed has in that scenario alone.
+    """
+
+    scenarios: tuple[Scenario, ...]
+    """The scenarios, ordered by name."""
+    shares: tuple[float, ...]
+    """Each scenario's share of the episodes [-]; the sum is 1."""
+
+    @property
+    def name(self) -> str:
+        """Shares and names."""
+        return " + ".join(f"{share:.4g} {each.name}" for share, each in zip(self.shares, self.scenarios, strict=True))
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of the scenarios' contents and their shares (16 hex digits)."""
+        contents = [[each.hash, share] for each, share in zip(self.scenarios, self.shares, strict=True)]
+        return hashlib.sha256(json.dumps(contents).encode()).hexdigest()[:16]
+
+    @property
+    def deterministic(self) -> bool:
+        """Whether all its episodes are the same."""
+        return len(self.scenarios) == 1 and self.scenarios[0].deterministic
+
+
+Distribution = Scenario | Mixture
+"""What episodes are drawn from."""
+AnyScenario = str | Path | Scenario | Mixture | Mapping[Any, float]
+"""The environment's ``scenario`` argument: a name, a scenario, scenarios or names with their shares, or a CSV file of
+disturbances from logs."""
+
+
+def make_mixture(shares: list[tuple[Scenario, Any]]) -> Mixture:
+    """Scenarios with positive shares, of whatever sum, as a mixture; CzError for anything else."""
+    for scenario, share in shares:
+        number = isinstance(share, Real) and not isinstance(share, bool)
+        if not (number and 0.0 < share < math.inf):
+            raise CzError(f"a mixture's shares must be positive numbers: that of {scenario.name!r} is {share!r}")
+    ordered = sorted(shares, key=lambda pair: pair[0].name)
+    scenarios = tuple(scenario for scenario, _ in ordered)
+    names = [scenario.name for scenario in scenarios]
+    if not names:
+        raise CzError("a mixture needs at least one scenario with its share")
+    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+        raise CzError(f"a mixture's scenarios need different names: {twice[0]!r} is there twice")
+    whole = math.fsum(float(share) for _, share in ordered)
+    return Mixture(scenarios, tuple(float(share) / whole for _, share in ordered))
+
+
+# Series of disturbances from logs: a CSV file that ``cz-gym identify LOG --series FILE.csv`` writes, as a scenario.
+#
+# Each episode meets one of its series, drawn by the seed: the heat load on the melt and the fluctuation of the
+# interface temperature stand in place of drawn ones. The sensors' noise is that of ``randomized``, or the puller
+# file's.
+
+Floats = npt.NDArray[np.float64]
+COLUMNS = "series", "time_s", "load_W", "fluctuation_K"
+MIX = 0.5
+"""Share of conduction that an identification assumes where a log does not tell it [-]."""
+
+
+def to_csv(series: Sequence[tuple[Floats, Floats, Floats]]) -> str:
+    """The text of a file: of each series its times [s], loads [W] and fluctuations [K], each of shape (rows,)."""
+    rows = [f"{k},{t:.10g},{q:.8g},{d:.8g}" for k, each in enumerate(series) for t, q, d in zip(*each, strict=True)]
+    return "\n".join([",".join(COLUMNS), *rows, ""])
+
+
+def read_series(path: Path, sensor: Sensor) -> Distribution:
+    """The scenario of a file, a mixture if it holds several series; CzError for what is none."""
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            table = list(csv.DictReader(file))
+        numbers = np.array([[float(row[name]) for name in COLUMNS] for row in table])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CzError(f"scenario {path}: must be a CSV file with columns {', '.join(COLUMNS)}: {error!r:.80}") from None
+    if not len(numbers) or not np.isfinite(numbers).all():
+        raise CzError(f"scenario {path}: every row needs four finite numbers, and there must be one")
+    names = np.unique(numbers[:, 0])
+    each = [_on_grid(numbers[numbers[:, 0] == name, 1:], path) for name in names]
+    scenarios = [
+        Scenario(
+            path.stem if len(each) == 1 else f"{path.stem}-{name:g}", Pullers(mix=(MIX, MIX)), sensor=sensor, series=one
+        )
+        for name, one in zip(names, each, strict=True)
+    ]
+    return scenarios[0] if len(scenarios) == 1 else make_mixture([(one, 1.0) for one in scenarios])
+
+
+def _on_grid(rows: Floats, path: Path) -> tuple[tuple[float, float], ...]:
+    """Load and fluctuation of rows (time, load, fluctuation), straight between them, on the grid."""
+    time = rows[:, 0]
+    if (np.diff(time) <= 0.0).any() or time[0] < 0.0:
+        raise CzError(f"scenario {path}: the times of a series must begin at 0 or later, and grow")
+    at = GRID * np.arange(int(time[-1] / GRID) + 1)
+    return tuple(zip(*(np.interp(at, time, column).tolist() for column in rows[:, 1:].T), strict=True))
+
+
+def series_table(scenarios: Sequence[Scenario]) -> Any:
+    """The series of scenarios as an array for the compiled loops, shape (scenarios, points, 2); no points: none."""
+    points = max(len(each.series) for each in scenarios)
+    table = np.full((len(scenarios), points, 2), np.nan)
+    for row, each in zip(table, scenarios, strict=True):
+        if each.series:
+            row[:] = [*each.series, *[each.series[-1]] * (points - len(each.series))]
+    return table

@@ -5,13 +5,26 @@ from dataclasses import replace
 from numbers import Real
 from pathlib import Path
 
-from cz_gym.errors import CzError
+from cz_gym.support.errors import CzError
 from cz_gym.support.names import unknown
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
-from .log_series import read_series
-from .mixture import AnyScenario, Distribution, Mixture, make_mixture
-from .scenario import Actuators, Drift, Faults, Interface, Pullers, Recipe, Reference, Scenario, Sensor
+from .scenario import (
+    Actuators,
+    AnyScenario,
+    Distribution,
+    Drift,
+    Faults,
+    Interface,
+    Mixture,
+    Pullers,
+    Recipe,
+    Reference,
+    Scenario,
+    Sensor,
+    make_mixture,
+    read_series,
+)
 
 K_PER_MIN = 1.0 / MINUTE
 

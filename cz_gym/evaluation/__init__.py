@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cz_gym.support.atomic_files import write_files
+from cz_gym.support.files import write_files
 from cz_gym.support.names import needs
 from cz_gym.support.units import MM
 
@@ -24,8 +24,7 @@ def plot(run: Rollout, episode: int = 0, path: str | Path | None = None) -> Figu
 
     Needs matplotlib. IndexError for an episode that is not there, ValueError for what is no rollout.
     """
-    from .report.canvas import COLOURS, png
-    from .report.crystal import DrawnCrystal, draw
+    from .plots import COLOURS, DrawnCrystal, draw, png
 
     needs(Rollout, run, "cz_gym.evaluation.rollout.rollout(policy, config, seeds) makes one")
     if not -len(run.seeds) <= episode < len(run.seeds):

@@ -7,11 +7,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from cz_gym.evaluation.contender import Contender
-
-from .crystal_metrics import measured
-from .metrics import Metrics, names_of, outside
-from .protocol import Case
+from .metrics import Metrics, measured, names_of, outside
+from .protocol import Case, Contender
 from .rollout import Floats, Rollout
 from .statistics import Estimate, Resamples, cvar, differences, means, optimality_gap, probability_of_improvement
 

@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import Any, Self
 
 from cz_gym.config import Config
-from cz_gym.episodes.mixture import Distribution
-from cz_gym.episodes.scenario import Scenario
+from cz_gym.episodes.scenario import Distribution, Scenario
 from cz_gym.episodes.scenarios import SCENARIOS, find_distribution, find_scenario
-from cz_gym.errors import CzError
-from cz_gym.evaluation.contender import Contender
+from cz_gym.support.errors import CzError
 from cz_gym.support.names import unknown
 
-from .protocol import Case
+from .protocol import Case, Contender
 
 
 def load(place: str, kind: str, fits: Callable[[Any, str], bool]) -> tuple[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.jit.compile import jittable, static
+from cz_gym.jit import jittable, static
 
 SQRT_2, SQRT_HALF = math.sqrt(2.0), math.sqrt(0.5)
 
@@ -21,7 +21,7 @@ class MeniscusModel(NamedTuple):
     """A model of the meniscus for the plant: its name and its functions.
 
     ``slope`` and ``ring_offset`` take ``(r_c, h_c, p)``, ``height`` takes ``(r_c, theta, a)``. All three are marked
-    ``cz_gym.jit.compile.jittable`` and compile into the step, which makes no array: they hold arithmetic, ``np.sqrt``
+    ``cz_gym.jit.jittable`` and compile into the step, which makes no array: they hold arithmetic, ``np.sqrt``
     and its like, ``min`` and ``max`` on numbers, but not ``np.where``.
     """
 

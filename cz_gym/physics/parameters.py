@@ -4,7 +4,7 @@ import math
 from numbers import Real
 from typing import Any, NamedTuple, get_type_hints
 
-from cz_gym.errors import CzError
+from cz_gym.support.errors import CzError
 from cz_gym.support.units import CELSIUS, MM, MM_PER_MIN
 
 from .quantities import MACHINE, Quantity
@@ -16,7 +16,7 @@ class Parameters(NamedTuple):
     """The parameters of a puller and its material; SI units, kelvin, radians.
 
     Nominal temperatures, power, meniscus height and heat fluxes are *derived* from these by
-    :func:`cz_gym.body.plant.make_puller`. Another puller or material is another instance:
+    :func:`cz_gym.physics.plant.make_puller`. Another puller or material is another instance:
     ``Parameters(r_0=0.1)`` or ``Parameters()._replace(sigma=0.83)``. ``describe`` has each one's unit, meaning,
     source and range.
     """

@@ -8,9 +8,11 @@ import math
 from functools import partial
 from typing import NamedTuple
 
-from cz_gym.errors import CzError
+from cz_gym.support.errors import CzError
 from cz_gym.support.units import CELSIUS, HOUR, KILO, MINUTE, MM, MM_PER_MIN, PERCENT
 
+Range = tuple[float, float]
+"""The ends of a range from which a number is drawn; equal ends are a number."""
 SIZES: dict[str, dict[str, float]] = {
     "m": {"mm": MM, "cm": 1e-2, "µm": 1e-6}, "m/s": {"mm/min": MM_PER_MIN, "mm/h": MM / HOUR, "mm/s": MM},
     "m/s2": {"mm/min2": MM_PER_MIN / MINUTE, "mm/s2": MM}, "rad": {"deg": math.pi / 180.0}, "1": {"%": PERCENT},

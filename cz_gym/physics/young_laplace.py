@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.jit.compile import jittable
+from cz_gym.jit import jittable
 
 from .meniscus import MeniscusModel, hurle_height, profile, ring_point
 

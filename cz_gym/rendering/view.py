@@ -9,13 +9,12 @@ from gymnasium.error import DependencyNotInstalled, Error, ResetNeeded
 
 from cz_gym.body.process import BODY
 from cz_gym.config import Config
-from cz_gym.errors import CzError
 from cz_gym.process import Process
+from cz_gym.support.errors import CzError
 from cz_gym.support.names import unknown
 
 from .canvas import MISSING, Frame, available, load
-from .picture import Picture
-from .record import DRAWN, Record, record_for
+from .picture import DRAWN, Picture, Record, record_for
 
 MODES = ("human", "rgb_array")
 FPS = 30

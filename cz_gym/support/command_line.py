@@ -9,7 +9,7 @@ from typing import NoReturn
 
 from gymnasium.error import DependencyNotInstalled
 
-from cz_gym.errors import CzError
+from .errors import CzError
 
 OPTIONAL = (
     "aiohttp", "array_api_compat", "asyncua", "blark", "casadi", "control", "distributed", "envpool", "filelock",

@@ -6,8 +6,8 @@ import re
 from typing import Any
 
 from cz_gym import Parameters
+from cz_gym.body.signals import Measured
 from cz_gym.camera.view import Camera
-from cz_gym.observation import Measured
 
 DESCRIBED: tuple[Any, ...] = (Parameters, Camera, Measured)
 """Records whose fields are in a table of a page."""

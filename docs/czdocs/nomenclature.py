@@ -8,9 +8,10 @@ from typing import NamedTuple
 from sphinx.pycode import ModuleAnalyzer
 
 from cz_gym import Parameters, Puller, State
-from cz_gym.body.plant import Disturbance, Inputs
 from cz_gym.body.signals import INFO_ROWS
 from cz_gym.physics.parameters import describe
+from cz_gym.physics.plant import Disturbance
+from cz_gym.process import Inputs
 
 PHYSICS = Path(__file__).parents[1] / "physics.md"
 GREEK = frozenset({"alpha", "kappa", "lam", "lambda", "phi", "rho", "sigma", "theta", "Phi"})

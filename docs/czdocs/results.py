@@ -6,12 +6,12 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from cz_gym.baselines.tuning.lqg import FAMILY
-from cz_gym.evaluation.equal_activity import ratios
-from cz_gym.evaluation.report.tables import markdown
+from cz_gym.baselines.tuned_lqg import FAMILY
+from cz_gym.evaluation.statistics import ratios
+from cz_gym.tools.report.tables import markdown
 
 ROOT = Path(__file__).parents[2]
-RECORDS = ROOT / "cz_gym" / "machine" / "pullers" / "default"
+RECORDS = ROOT / "cz_gym" / "puller" / "shipped" / "default"
 SCENARIOS = ("randomized", "hard", "sensor-fault", "puller", "hot-zone")
 OBSERVABLE = ("sensor-fault", "puller")
 """Scenarios whose true radius error holds an offset of the ring, which no sensor shows."""

@@ -13,18 +13,18 @@ from pathlib import Path
 from typing import Any
 
 from cz_gym import SCENARIOS, Scenario
-from cz_gym.body.signals import INFO_ROWS, PULL_SCALE
+from cz_gym.body.signals import INFO_ROWS
 from cz_gym.camera.view import Camera
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.episodes.scenario import FAMILIES
 from cz_gym.episodes.scenarios import RANDOMIZED
-from cz_gym.machine.puller import DEFAULT, value_of
-from cz_gym.machine.serve.crystal import OWN_TAGS
-from cz_gym.machine.serve.machine import TAGS, Tag
-from cz_gym.observation import HISTORY, LAGGED, LAGS, MEASURED, STATE, Channel
 from cz_gym.physics.parameters import describe
 from cz_gym.physics.quantities import MACHINE, Quantity
+from cz_gym.process import PULL_SCALE, Channel
+from cz_gym.puller.file import DEFAULT, value_of
+from cz_gym.spaces import HISTORY, LAGGED, LAGS, MEASURED, STATE
 from cz_gym.support.units import MINUTE
+from cz_gym.tools.serve.machine import OWN_TAGS, TAGS, Tag
 
 from . import nomenclature, results
 

@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cz_gym import HURLE, make_puller
-from cz_gym.baselines.analysis.compensator_design import design_compensator, margins
-from cz_gym.baselines.pid.compensated_pid import CompensatedPID
-from cz_gym.body.linearisation import radius_model
-from cz_gym.evaluation.report.tables import markdown as table
+from cz_gym.baselines.analysis import design_compensator, margins
+from cz_gym.baselines.pid import CompensatedPID
+from cz_gym.body.process import radius_model
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.support.atomic_files import check_writable, write_files
 from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.files import check_writable, write_files
 from cz_gym.support.units import HOUR, MM
+from cz_gym.tools.report.tables import markdown as table
 
 from . import experiments as ex
 from .experiments import COMPENSATOR, CROSSOVER, ODE, PHASE_MARGIN_DEG, PID, PUBLISHED, ZERO
@@ -233,7 +233,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _compare(given: argparse.Namespace) -> None:
     import control  # noqa: F401  (missing? say so before the work, not after it)
 
-    from cz_gym.evaluation.report.canvas import png
+    from cz_gym.evaluation.plots import png
 
     from .figures import FIGURES
 

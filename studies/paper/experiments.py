@@ -10,15 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym import HURLE, MeniscusModel, Scenario, make_puller
-from cz_gym.baselines.analysis.compensator_design import Margins, design_compensator, margins
-from cz_gym.baselines.pid.compensated_pid import CompensatedPID, Compensator, SeriesPID
-from cz_gym.body.linearisation import RadiusModel, radius_model
+from cz_gym.baselines.analysis import Margins, design_compensator, margins
+from cz_gym.baselines.pid import CompensatedPID, Compensator, SeriesPID
+from cz_gym.body.process import RadiusModel, radius_model
 from cz_gym.body.signals import Logged
 from cz_gym.config import make_config
-from cz_gym.episodes.schedule import quintic
-from cz_gym.evaluation.replay import Playback
-from cz_gym.evaluation.rollout import rollout
-from cz_gym.physics.linearisation import Floats
+from cz_gym.evaluation.rollout import Playback, rollout
+from cz_gym.physics.numerics import Floats
+from cz_gym.physics.schedule import quintic
 from cz_gym.support.units import HOUR, MINUTE, MM, MM_PER_MIN
 
 MODEL_I = RadiusModel(numerator=-0.0047626, poles=(8.78e-6, -1.684e-3), lead=-47.1864, constant=1.0041)

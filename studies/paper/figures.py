@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cz_gym import make_puller
-from cz_gym.baselines.analysis.compensator_design import open_loop
-from cz_gym.evaluation.report.canvas import GREY, canvas
-from cz_gym.physics.linearisation import Floats
+from cz_gym.baselines.analysis import open_loop
+from cz_gym.evaluation.plots import GREY, canvas
+from cz_gym.physics.numerics import Floats
 from cz_gym.support.units import MINUTE, MM, MM_PER_MIN
 
 from . import experiments as ex

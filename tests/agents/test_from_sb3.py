@@ -19,13 +19,13 @@ from torch import nn
 
 from cz_gym import CzEnv, sb3
 from cz_gym.agents import AgentFileError, OnnxPolicy, from_sb3
-from cz_gym.agents.agent_file.contract import make_contract
 from cz_gym.agents.apg import APG
+from cz_gym.agents.contract import make_contract
 from cz_gym.agents.export import to_onnx
 from cz_gym.config import make_config
-from cz_gym.machine.export.agent import network_of
-from cz_gym.machine.export.trace import Graph
-from cz_gym.observation import HISTORY
+from cz_gym.spaces import HISTORY
+from cz_gym.tools.export.controllers import network_of
+from cz_gym.tools.export.trace import Graph
 from tests.contracts import facts
 
 pytestmark = pytest.mark.usefixtures("few_crystals")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cz_gym import agents
-from cz_gym.agents.agent_file.contract import read_agent
+from cz_gym.agents.contract import read_agent
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 

@@ -11,18 +11,16 @@ from hypothesis import strategies as st
 
 from cz_gym import CzVectorEnv, Parameters
 from cz_gym.baselines import CompensatedPID, Compensator, SeriesPID
-from cz_gym.baselines.lqg.model import NoiseModel
-from cz_gym.baselines.lqg.ring_model import RingModel
-from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
+from cz_gym.baselines.lqg_filter import NoiseModel, RingModel
+from cz_gym.baselines.pid import FilteredPID, TemperatureLoop
 from cz_gym.baselines.policy import Policy
-from cz_gym.baselines.registry import CONTROLLERS, find_controller, make_controller
 from cz_gym.config import make_config
-from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.observation import MEASURED
-from cz_gym.support.nested import map_arrays
+from cz_gym.spaces import MEASURED
+from cz_gym.support.errors import CzError
+from cz_gym.support.names import map_arrays
+from cz_gym.tools.registry import CONTROLLERS, find_controller, make_controller
 from tests.observed import PLAIN, actions_of, measured, observations
 
 CASES = [(entry.name, "randomized") for entry in CONTROLLERS if entry.observation == "measured" and not entry.slow]

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from cz_gym import CzEnv, CzVectorEnv
-from cz_gym.body.cost import PULL_TOLERANCE, Cost, Weights, coefficients, cost_slopes, cost_terms
+from cz_gym.body.signals import PULL_TOLERANCE, Cost, Weights, coefficients, cost_slopes, cost_terms
 from cz_gym.config import make_config
-from cz_gym.differentiable import DifferentiableBatch
+from cz_gym.engine.tangents import DifferentiableBatch
 
 V_0 = 1.2e-3 / 60
 

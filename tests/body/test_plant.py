@@ -7,11 +7,12 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from cz_gym import SCENARIOS, CzEnv, Parameters, State, make_puller
-from cz_gym.body.plant import NO_DISTURBANCE, Disturbance, Inputs, disturbance, growth, hidden_load, rates, rk4
 from cz_gym.episodes.scenario import Actuators
-from cz_gym.jit.compile import kernel
-from cz_gym.physics.linearisation import jacobian
+from cz_gym.jit import kernel
 from cz_gym.physics.meniscus import hurle_slope
+from cz_gym.physics.numerics import jacobian
+from cz_gym.physics.plant import NO_DISTURBANCE, Disturbance, disturbance, growth, hidden_load, rates, rk4
+from cz_gym.process import Inputs
 from cz_gym.support.units import HOUR
 from tests.equations import Truth, design_rates, drawn, fields, hold, integrated
 

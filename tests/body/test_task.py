@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cz_gym import CzEnv, make_puller
-from cz_gym.body.cost import Cost, cost_terms, reward
-from cz_gym.body.task import within_limits
+from cz_gym.body.signals import Cost, cost_terms, reward
+from cz_gym.physics.plant import within_limits
 from tests.observed import PLAIN
 
 MM, MM_PER_MIN = 1e-3, 1e-3 / 60

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cz_gym.evaluation.report.page import page
+from cz_gym.tools.report.page import page
 from tests.browser.chromium import chromium, pytestmark, resize, until  # noqa: F401
 from tests.samples import result_of
 

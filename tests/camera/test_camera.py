@@ -7,12 +7,10 @@ from gymnasium.utils.env_checker import check_env as check_with_gymnasium
 from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
 from cz_gym import CzEnv, Parameters, make_puller
-from cz_gym.camera.image import picture
-from cz_gym.camera.rays import make_scene
-from cz_gym.camera.ring_detector import RingDetector, wall_edge
-from cz_gym.camera.view import COLUMNS, IMAGE, ROWS, Camera, camera_for, check_camera, make_view
+from cz_gym.camera.image import RingDetector, picture, wall_edge
+from cz_gym.camera.view import COLUMNS, IMAGE, ROWS, Camera, camera_for, check_camera, make_scene, make_view
 from cz_gym.config import make_config
-from cz_gym.episodes.record import stream_number
+from cz_gym.episodes.draw import stream_number
 from cz_gym.episodes.scenario import Scenario, Sensor
 from cz_gym.physics.meniscus import hurle_ring_offset
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE

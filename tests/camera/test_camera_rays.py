@@ -6,11 +6,23 @@ import pytest
 from scipy.optimize import bisect
 
 from cz_gym import make_puller
-from cz_gym.camera import rays
-from cz_gym.camera.image import radiance, sight
-from cz_gym.camera.rays import FLAT, MELT, Hit, Ray, Scene, first_hit, make_scene, mirror, profile_at, slope_at
-from cz_gym.camera.ring_detector import wall_edge
-from cz_gym.camera.view import Camera, make_view, project
+from cz_gym.camera import view as rays
+from cz_gym.camera.image import radiance, sight, wall_edge
+from cz_gym.camera.view import (
+    FLAT,
+    MELT,
+    Camera,
+    Hit,
+    Ray,
+    Scene,
+    first_hit,
+    make_scene,
+    make_view,
+    mirror,
+    profile_at,
+    project,
+    slope_at,
+)
 from cz_gym.physics.meniscus import hurle_slope, profile
 
 PULLER = make_puller()

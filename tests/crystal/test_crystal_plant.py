@@ -9,18 +9,17 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from cz_gym import Parameters, make_puller
-from cz_gym.body import plant as body
 from cz_gym.crystal import plant, recipe
-from cz_gym.crystal.parameters import complete
-from cz_gym.crystal.plant import Disturbance, State, at_interface, rates
+from cz_gym.crystal.plant import Disturbance, State, at_interface, complete, rates
 from cz_gym.crystal.process import nominal_recipe
-from cz_gym.crystal.shape import shape_at
-from cz_gym.episodes.record import Episode, Factors
-from cz_gym.episodes.schedule import melt_left
-from cz_gym.machine.puller import DEFAULT
-from cz_gym.physics.arithmetic import rk4
+from cz_gym.crystal.recipe import shape_at
+from cz_gym.episodes.draw import Episode, Factors
+from cz_gym.physics import plant as body
 from cz_gym.physics.meniscus import HURLE, hurle_height, hurle_slope
+from cz_gym.physics.numerics import rk4
+from cz_gym.physics.schedule import melt_left
 from cz_gym.process import Inputs
+from cz_gym.puller.file import DEFAULT
 from cz_gym.support.units import MM
 from tests.physics.test_young_laplace import solve
 

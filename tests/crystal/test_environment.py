@@ -13,10 +13,10 @@ from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
 import cz_gym
 from cz_gym.crystal import signals
-from cz_gym.crystal_env import CzCrystalEnv, CzCrystalVectorEnv
-from cz_gym.episodes.scenario import DRAW_SPAN
+from cz_gym.env import CzCrystalEnv, CzCrystalVectorEnv
 from cz_gym.episodes.scenarios import NOMINAL
-from cz_gym.observation import decode
+from cz_gym.physics.schedule import DRAW_SPAN
+from cz_gym.spaces import decode
 from cz_gym.support.units import HOUR, MM
 from tests.vector_checker import check_vector_env
 

@@ -6,19 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cz_gym.commands import recipe as command
 from cz_gym.config import make_config
-from cz_gym.crystal.linearisation import along
-from cz_gym.crystal.process import CRYSTAL, nominal_recipe
-from cz_gym.crystal.shape import growth_rate, shape_at
-from cz_gym.crystal_env import CzCrystalEnv
-from cz_gym.episodes.record import Episode
-from cz_gym.errors import CzError
-from cz_gym.machine.puller import DEFAULT, PullerFile, find_puller, from_toml
+from cz_gym.crystal.process import CRYSTAL, along, nominal_recipe
+from cz_gym.crystal.recipe import growth_rate, shape_at
+from cz_gym.env import CzCrystalEnv
+from cz_gym.episodes.draw import Episode
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.parameters import Recipe
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+from cz_gym.puller.file import DEFAULT, PullerFile, find_puller, from_toml
+from cz_gym.support.errors import CzError
 from cz_gym.support.units import HOUR, MM
+from cz_gym.tools import recipe as command
 
 CALM = {"scenario": "nominal", "observation": "measured", "action": "direct", "info": "all"}
 

@@ -4,16 +4,15 @@ import minari
 import numpy as np
 import pytest
 
-from cz_gym import behaviour, datasets
 from cz_gym.baselines import CompensatedPID
-from cz_gym.behaviour import find_policy, settings_of
 from cz_gym.config import make_config
-from cz_gym.datasets import excitation, main, place_of, record, write
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
-from cz_gym.evaluation.replay import Playback
-from cz_gym.evaluation.rollout import rollout
-from cz_gym.machine.puller import DEFAULT, find_puller
-from cz_gym.observation import DRIVE_CHANNELS
+from cz_gym.evaluation.rollout import Playback, rollout
+from cz_gym.puller.file import DEFAULT, find_puller
+from cz_gym.spaces import DRIVE_CHANNELS
+from cz_gym.tools import datasets
+from cz_gym.tools import datasets as behaviour
+from cz_gym.tools.datasets import excitation, find_policy, main, place_of, record, settings_of, write
 
 CONFIG = make_config("randomized", action="direct", horizon=1200.0)
 

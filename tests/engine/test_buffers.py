@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cz_gym import CzVectorEnv
-from cz_gym.engine.buffers import SPARES, BufferPool
+from cz_gym.engine.slots import SPARES, BufferPool
 
 SHAPE = 64, 64
 

@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 
 from cz_gym import CzEnv, CzVectorEnv, Parameters, make_puller
-from cz_gym.body.plant import Disturbance, Inputs, State, rk4
 from cz_gym.body.process import accept_substep
-from cz_gym.body.task import HEIGHT_MIN
-from cz_gym.episodes.draw import randomised
-from cz_gym.episodes.record import Factors
+from cz_gym.episodes.draw import Factors, randomised
 from cz_gym.physics.meniscus import HURLE
+from cz_gym.physics.plant import HEIGHT_MIN, Disturbance, State, rk4
+from cz_gym.process import Inputs
 from tests.equations import Truth, integrated
 from tests.observed import PLAIN
 from tests.stress.__main__ import WIDE, campaign, cases

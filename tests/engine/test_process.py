@@ -16,18 +16,17 @@ from scipy.integrate import solve_ivp
 from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
 from cz_gym import CzEnv, CzVectorEnv
-from cz_gym.body.cost import WEIGHTS, Cost, cost_slopes, cost_terms, reward
+from cz_gym.body.signals import WEIGHTS, Cost, cost_slopes, cost_terms, reward
 from cz_gym.config import make_config
-from cz_gym.differentiable import DifferentiableBatch
-from cz_gym.episodes.schedule import bias_offset, recipe, reference
-from cz_gym.evaluation.contender import Contender
-from cz_gym.evaluation.protocol import Case
-from cz_gym.evaluation.report.tables import DRIVES, ERROR, rows
+from cz_gym.engine.tangents import DifferentiableBatch
+from cz_gym.evaluation.protocol import Case, Contender
 from cz_gym.evaluation.results import summarise
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.evaluation.runner import run_episodes
-from cz_gym.jit.compile import force_inlined, jittable
+from cz_gym.jit import force_inlined, jittable
+from cz_gym.physics.schedule import bias_offset, recipe, reference
 from cz_gym.process import DONE, GROWS, LOST, PULL_SCALE, Channel, Inputs, Past, Process, Relative, Seen
+from cz_gym.tools.report.tables import DRIVES, ERROR, rows
+from cz_gym.tools.run import run_episodes
 from tests.vector_checker import check_vector_env
 
 # The process: at most 80 lines to the mark below.
@@ -146,7 +145,7 @@ TANK = Process(
 )  # fmt: skip
 # The end of the process.
 
-gym.register("Tank-v0", "cz_gym.env:CzEnv", vector_entry_point="cz_gym.vector:CzVectorEnv", kwargs={"process": TANK})
+gym.register("Tank-v0", "cz_gym.env:CzEnv", vector_entry_point="cz_gym.env:CzVectorEnv", kwargs={"process": TANK})
 SETTINGS = {"scenario": "randomized", "control_interval": 20.0, "horizon": 1200.0, "info": "all"}
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
-from cz_gym.engine.drives import mean_power
+from cz_gym.engine.loop import mean_power
 
 NOMINAL, KW = SCENARIOS["nominal"], 1000.0
 

@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
-from cz_gym.observation import OBSERVATIONS
+from cz_gym.spaces import OBSERVATIONS
 from tests.vector_checker import check_vector_env
 
 SHORT = {"control_interval": 60.0, "horizon": 1200.0}

@@ -7,9 +7,9 @@ from gymnasium.error import InvalidAction, ResetNeeded
 
 import cz_gym
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv, Parameters, Scenario, make_puller
-from cz_gym.body.plant import Disturbance, State, growth
 from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Actuators
+from cz_gym.physics.plant import Disturbance, State, growth
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from tests.observed import PLAIN
 

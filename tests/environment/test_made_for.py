@@ -5,10 +5,10 @@ import pytest
 from gymnasium.error import InvalidAction
 
 from cz_gym import CzEnv, CzVectorEnv, Parameters
-from cz_gym.action import mark
 from cz_gym.config import make_config
-from cz_gym.differentiable import DifferentiableBatch
+from cz_gym.engine.tangents import DifferentiableBatch
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+from cz_gym.spaces import mark
 from tests.observed import PLAIN
 
 OWN = make_config(horizon=600.0, **PLAIN)

@@ -11,7 +11,7 @@ import pytest
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
 from cz_gym.config import make_config
 from cz_gym.engine.batch import first_key
-from cz_gym.episodes.record import MIXTURE_STREAM
+from cz_gym.episodes.draw import MIXTURE_STREAM
 from cz_gym.episodes.scenarios import ALL, find_distribution
 
 MIX = {"puller": 1.0, "randomized": 2.0, replace(SCENARIOS["hard"], name="mine"): 1.0}

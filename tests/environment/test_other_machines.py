@@ -26,7 +26,7 @@ NOBODY = """
 import pwd
 def missing(user): raise KeyError(user)
 pwd.getpwuid = missing
-from cz_gym.jit.cache import cache_folder
+from cz_gym.jit import cache_folder
 print(cache_folder())
 """
 CURVES = """

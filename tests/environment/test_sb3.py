@@ -13,8 +13,8 @@ from cz_gym import CzEnv, CzVectorEnv
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.asymmetric import AsymmetricPolicy, AsymmetricSACPolicy, LearnState
 from cz_gym.agents.from_sb3 import save_agent
-from cz_gym.errors import CzError
 from cz_gym.sb3 import make_vec_env
+from cz_gym.support.errors import CzError
 
 N = 3
 SETTINGS = {"scenario": "hard", "control_interval": 20.0, "horizon": 400.0}

@@ -9,10 +9,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from cz_gym import SCENARIOS, Parameters, Scenario, make_puller
-from cz_gym.episodes.draw import randomised
-from cz_gym.episodes.record import FREEZES, Episode, Factors
+from cz_gym.episodes.draw import FREEZES, Episode, Factors, episode_from_key, factors_from_key, new_series, randomised
 from cz_gym.episodes.scenario import Actuators, Draw, Faults, Interface, Recipe, Reference, Sensor
-from cz_gym.episodes.series import draw_episode, draw_factors, new_series
 
 MM, MINUTE, SPAN = 1e-3, 60.0, 10800.0
 WORD = st.integers(0, 2**64 - 1)
@@ -24,7 +22,7 @@ def draw(scenario, key, grid=50, samples=50):
     series = new_series(grid, samples)
     for array in series:
         array[:] = 7.0
-    return draw_episode(found, key, series), series
+    return episode_from_key(found, key, series), series
 
 
 def keys(n):
@@ -129,7 +127,8 @@ def test_every_member_says_whether_it_is_random(family, member, spread):
     random = says.draw in (Draw.NONZERO, Draw.CHANCE) or (says.draw is Draw.RANGE and low != high)
     assert scenario.deterministic is not random
     drawn = [
-        (draw_factors(scenario, part.mix, key) if family == "pullers" else (), felt(scenario, key)) for key in keys(12)
+        (factors_from_key(scenario, part.mix, key) if family == "pullers" else (), felt(scenario, key))
+        for key in keys(12)
     ]
     equal = all(one[0] == drawn[0][0] and same(one[1], drawn[0][1]) for one in drawn)
     assert equal is scenario.deterministic or (equal and "flagged_duration" in member.name)
@@ -158,7 +157,7 @@ def test_families_share_no_random_number():
     alone, _ = draw("only-parameters", key)
     assert alone.r_c_start == whole.r_c_start
     assert alone.drift_amount == 0.0
-    factors = [draw_factors(SCENARIOS[name], (0.0, 1.0), key) for name in ("only-parameters", "randomized")]
+    factors = [factors_from_key(SCENARIOS[name], (0.0, 1.0), key) for name in ("only-parameters", "randomized")]
     assert factors[0] == factors[1]
 
 
@@ -176,7 +175,7 @@ def test_interface_fluctuation_is_two_stationary_processes():
 
 def test_factors_are_uniform_and_those_of_hot_zones_log_uniform_on_the_same_crystals():
     hot_zone, randomized = (
-        np.array([draw_factors(SCENARIOS[name], (0.0, 1.0), key) for key in keys(2000)])
+        np.array([factors_from_key(SCENARIOS[name], (0.0, 1.0), key) for key in keys(2000)])
         for name in ("hot-zone", "randomized")
     )
     assert (randomized[:, 7:] == 1.0).all()

@@ -5,11 +5,11 @@ import pytest
 
 from cz_gym import CzEnv
 from cz_gym.config import make_config
-from cz_gym.episodes.log_series import to_csv
+from cz_gym.episodes.scenario import to_csv
 from cz_gym.episodes.scenarios import find_scenario
-from cz_gym.errors import CzError
 from cz_gym.evaluation.user_code import case
-from cz_gym.machine.puller import find_puller
+from cz_gym.puller.file import find_puller
+from cz_gym.support.errors import CzError
 
 TIME = np.array([0.0, 10.0, 30.0])
 FIRST = TIME, np.array([0.0, 100.0, 300.0]), np.array([0.5, -0.5, 0.0])

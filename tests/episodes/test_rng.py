@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cz_gym.episodes.record import Stream
+from cz_gym.episodes.draw import Stream
 from cz_gym.episodes.rng import WORDS, next_word, normal, seed_stream, two_normals, uniform
-from cz_gym.jit.compile import kernel
+from cz_gym.jit import kernel
 
 WORD = st.one_of(st.integers(0, 2**64 - 1), st.sampled_from([0, 1, 2**32 - 1, 2**32, 2**64 - 1]))
 

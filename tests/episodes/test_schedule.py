@@ -2,18 +2,17 @@ import numpy as np
 import pytest
 
 from cz_gym import SCENARIOS, make_puller
-from cz_gym.body.plant import disturbance, hidden_load
-from cz_gym.episodes import schedule
-from cz_gym.episodes.record import Episode
-from cz_gym.episodes.schedule import bias_offset, drift, pyrometer_drift, recipe, reference, ripple
-from cz_gym.episodes.series import draw_episode, new_series
+from cz_gym.episodes.draw import Episode, episode_from_key, new_series
+from cz_gym.physics import schedule
+from cz_gym.physics.plant import disturbance, hidden_load
+from cz_gym.physics.schedule import bias_offset, drift, pyrometer_drift, recipe, reference, ripple
 
 MINUTE = 60.0
 THREE_HOURS = 10800.0
 
 
 def episode(scenario):
-    return draw_episode(SCENARIOS[scenario], (1, 2), new_series(10, 10))
+    return episode_from_key(SCENARIOS[scenario], (1, 2), new_series(10, 10))
 
 
 def test_quintic_has_no_rate_and_no_curvature_at_its_ends():

@@ -10,17 +10,16 @@ import pytest
 
 import cz_gym
 import cz_gym.agents
-from cz_gym.baselines import OpenLoop, registry
-from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
-from cz_gym.commands import benchmark
+from cz_gym.baselines import OpenLoop
+from cz_gym.baselines.clairvoyant import Clairvoyant
 from cz_gym.config import make_config
-from cz_gym.evaluation import cache, runner
-from cz_gym.evaluation.cache import code_behind, sources_behind
-from cz_gym.evaluation.contender import Contender
 from cz_gym.evaluation.metrics import metric_names
-from cz_gym.evaluation.protocol import Case
+from cz_gym.evaluation.protocol import Case, Contender
 from cz_gym.evaluation.results import Sample
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.tools import benchmark, registry, run
+from cz_gym.tools import run as runner
+from cz_gym.tools.run import code_behind, sources_behind
 from tests.observed import PLAIN
 
 CONFIG = make_config(horizon=300.0, **PLAIN)
@@ -124,11 +123,11 @@ def test_a_damaged_file_and_a_first_episode_without_signals_are_run_again(tmp_pa
     assert counted == [0, 1, 1, 1]
 
 
-@pytest.mark.parametrize("package", cache.COMPUTING)
+@pytest.mark.parametrize("package", run.COMPUTING)
 def test_another_version_of_a_package_that_computes_runs_cached_episodes_again(package, tmp_path, counted, monkeypatch):
     sample(tmp_path, seeds=range(1))
-    versions = cache.software(cache.COMPUTING)["packages"]
-    monkeypatch.setattr(cache, "software", lambda packages: {"packages": {**versions, package: "99"}})
+    versions = run.software(run.COMPUTING)["packages"]
+    monkeypatch.setattr(run, "software", lambda packages: {"packages": {**versions, package: "99"}})
     sample(tmp_path, seeds=range(1))
     assert counted == [0, 0]
 
@@ -137,7 +136,7 @@ def test_another_version_of_a_package_that_computes_runs_cached_episodes_again(p
     ("room", "computes"),
     [
         *((name, True) for name in ("physics", "body", "episodes", "engine", "evaluation/metrics.py")),
-        *((name, False) for name in ("rendering/palette.py", "camera", "evaluation/report")),
+        *((name, False) for name in ("rendering/canvas.py", "camera", "tools/report")),
     ],
 )
 def test_the_cache_key_holds_the_code_that_computes_and_not_the_code_that_draws(room, computes):

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 pytest.importorskip("distributed")
-from cz_gym.baselines.registry import find_controller
-from cz_gym.errors import CzError
-from cz_gym.evaluation import cluster, user_code
+from cz_gym.evaluation import parallel, user_code
 from cz_gym.evaluation.protocol import find_case
-from cz_gym.evaluation.runner import run
+from cz_gym.support.errors import CzError
+from cz_gym.tools.registry import find_controller
+from cz_gym.tools.run import run
 from tests.processes import ROOT
 
 ONCE = """
@@ -89,7 +89,7 @@ def test_two_workers_one_killed_bring_the_same_table(workers, tmp_path):
 
 def client(threads=1, sees=True, **others):
     workers = {"tcp://w:1": {"nthreads": threads}}
-    answers = {cluster.versions: cluster.versions() | others, os.path.isdir: sees}
+    answers = {parallel.versions: parallel.versions() | others, os.path.isdir: sees}
     return SimpleNamespace(
         scheduler_info=lambda n_workers: {"workers": workers}, run=lambda what, *_: {"tcp://w:1": answers[what]}
     )
@@ -108,12 +108,12 @@ def client(threads=1, sees=True, **others):
 )
 def test_workers_that_would_give_other_numbers_are_named(given, said, tmp_path):
     with pytest.raises(CzError, match=said):
-        cluster._check_workers(client(**given), tmp_path)
-    cluster._check_workers(client(), tmp_path)
+        parallel._check_workers(client(**given), tmp_path)
+    parallel._check_workers(client(), tmp_path)
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere", "ssh://a:b:c"])
 def test_an_address_without_a_scheduler_is_one_line(address, monkeypatch):
-    monkeypatch.setattr(cluster, "ANSWER", 0.5)
+    monkeypatch.setattr(parallel, "ANSWER", 0.5)
     with pytest.raises(CzError, match=f"no Dask scheduler answers at '{address}'"):
-        list(cluster.on_cluster(address, abs, [1]))
+        list(parallel.on_cluster(address, abs, [1]))

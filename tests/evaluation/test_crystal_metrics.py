@@ -9,8 +9,8 @@ from cz_gym.baselines.policy import OpenLoop
 from cz_gym.config import make_config
 from cz_gym.crystal import recipe
 from cz_gym.crystal.process import CRYSTAL, nominal_recipe
-from cz_gym.crystal.task import WAYS, room
-from cz_gym.evaluation.crystal_metrics import KWH, CrystalMetrics, crystal_metrics, measured
+from cz_gym.crystal.recipe import WAYS, room
+from cz_gym.evaluation.metrics import KWH, CrystalMetrics, crystal_metrics, measured
 from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.meniscus import HURLE

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from cz_gym.evaluation.equal_activity import frontier, intervals, ratios
-from cz_gym.evaluation.statistics import Resamples
+from cz_gym.evaluation.statistics import Resamples, frontier, intervals, ratios
 
 PAIRS = st.lists(st.tuples(st.floats(1e-4, 1.0), st.floats(1e-3, 10.0)), min_size=2, max_size=12)
 FAMILY = tuple(f"member-{i}" for i in range(8))

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cz_gym.baselines.pid.compensated_pid import CompensatedPID
-from cz_gym.body.cost import Cost, reward
-from cz_gym.body.signals import Logged
+from cz_gym.baselines.pid import CompensatedPID
+from cz_gym.body.signals import Cost, Logged, reward
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import Metrics, metrics
 from cz_gym.evaluation.rollout import Rollout, rollout

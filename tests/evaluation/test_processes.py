@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from cz_gym.evaluation.processes import in_processes
+from cz_gym.evaluation.parallel import in_processes
 from tests.processes import ROOT
 
 
@@ -61,7 +61,7 @@ def test_a_killed_process_is_one_line():
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
 def test_processes_end_with_a_killed_caller():
-    code = "from cz_gym.evaluation.processes import in_processes; from tests.evaluation.test_processes import *"
+    code = "from cz_gym.evaluation.parallel import in_processes; from tests.evaluation.test_processes import *"
     main = 'if __name__ == "__main__": list(in_processes(tell_and_wait, [0]))'
     with subprocess.Popen([sys.executable, "-c", f"{code}\n{main}"], cwd=ROOT, stdout=subprocess.PIPE) as caller:
         assert caller.stdout is not None

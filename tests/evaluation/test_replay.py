@@ -4,8 +4,7 @@ import pytest
 from cz_gym import CzVectorEnv
 from cz_gym.baselines import CompensatedPID
 from cz_gym.config import make_config
-from cz_gym.evaluation.replay import Playback, replay
-from cz_gym.evaluation.rollout import rollout
+from cz_gym.evaluation.rollout import Playback, replay, rollout
 from tests.observed import PLAIN
 
 CONFIG = make_config("puller", horizon=600.0, **PLAIN)

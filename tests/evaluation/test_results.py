@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 
 from cz_gym.baselines import CompensatedPID
-from cz_gym.baselines.registry import find_controller
-from cz_gym.commands import benchmark
 from cz_gym.config import make_config
-from cz_gym.evaluation.cache import earlier_bound
-from cz_gym.evaluation.files import to_csv
 from cz_gym.evaluation.metrics import metric_names
 from cz_gym.evaluation.protocol import TEST_SEEDS, find_case
-from cz_gym.evaluation.report.markdown import markdown
 from cz_gym.evaluation.results import Sample, summarise
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.statistics import Resamples, optimality_gap
-from cz_gym.support.atomic_files import write_files
+from cz_gym.support.files import write_files
+from cz_gym.tools import benchmark
+from cz_gym.tools.files import to_csv
+from cz_gym.tools.registry import find_controller
+from cz_gym.tools.report.markdown import markdown
+from cz_gym.tools.run import earlier_bound
 from tests.observed import PLAIN
 from tests.samples import contender
 

@@ -12,16 +12,14 @@ import cz_gym
 from cz_gym import CzEnv
 from cz_gym.agents import load
 from cz_gym.baselines import CompensatedPID, OpenLoop
-from cz_gym.baselines.registry import make_controller
-from cz_gym.body.signals import Logged
+from cz_gym.body.signals import Logged, Measured
 from cz_gym.camera import Camera
 from cz_gym.config import make_config
-from cz_gym.errors import CzError
 from cz_gym.evaluation import plot
-from cz_gym.evaluation.replay import Playback
-from cz_gym.evaluation.rollout import check_seeds, rollout
-from cz_gym.observation import Measured
+from cz_gym.evaluation.rollout import Playback, check_seeds, rollout
 from cz_gym.physics.parameters import Parameters
+from cz_gym.support.errors import CzError
+from cz_gym.tools.registry import make_controller
 from tests.observed import PLAIN
 
 SHORT = make_config("randomized", horizon=600.0, **PLAIN)

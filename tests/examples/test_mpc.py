@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cz_gym.baselines.registry import make_controller
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.episodes.scenarios import RANDOMIZED
@@ -13,6 +12,7 @@ from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.user_code import controller
 from cz_gym.support.units import KILO, MINUTE, MM_PER_MIN
+from cz_gym.tools.registry import make_controller
 from tests.observed import PLAIN
 
 SEEDS = range(1_000_000, 1_000_002)

@@ -8,9 +8,9 @@ import pytest
 
 from cz_gym.config import make_config
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.machine.export.controllers import make_block
-from cz_gym.machine.export.policy import BlockPolicy
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
+from cz_gym.tools.export.controllers import make_block
+from cz_gym.tools.export.shell import BlockPolicy
 from examples import opcua_controller
 from tests.machine.serve.conftest import PASSWORD, running
 

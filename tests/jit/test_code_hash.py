@@ -3,8 +3,7 @@
 from cz_gym import HURLE, Parameters
 from cz_gym.body.process import BODY
 from cz_gym.config import make_config
-from cz_gym.jit.cache import hash_files
-from cz_gym.jit.compile import jittable
+from cz_gym.jit import hash_files, jittable
 
 
 def test_a_changed_equation_is_another_plant_and_the_same_said_otherwise_is_not(monkeypatch):

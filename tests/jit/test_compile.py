@@ -11,15 +11,14 @@ import pytest
 from cz_gym import HURLE
 from cz_gym.body.process import BODY
 from cz_gym.engine.kernels import build_kernels
-from cz_gym.jit.cache import CachedCode, Store, cache_folder, source_hash
-from cz_gym.jit.compile import jittable, kernel
+from cz_gym.jit import CachedCode, Store, cache_folder, jittable, kernel, source_hash
 from cz_gym.physics.meniscus import hurle_height
 from tests.processes import ROOT, python
 
 FACTOR = """
 from cz_gym import SCENARIOS
 from cz_gym.episodes import series
-from cz_gym.jit.cache import cache_folder
+from cz_gym.jit import cache_folder
 a = series.draw_factors(SCENARIOS["randomized"], (0.0, 1.0), (1, 2)).a
 print(cache_folder(), a, sum(series._factors.stats.cache_hits.values()), sep="|")
 """
@@ -94,7 +93,7 @@ def test_code_for_other_types_is_not_used_and_a_full_disk_keeps_nothing(tmp_path
     def full(*arguments):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("cz_gym.support.atomic_files.os.replace", full)
+    monkeypatch.setattr("cz_gym.support.files.os.replace", full)
     store.save("floats", 1)
     assert store.load("floats") is None
     assert list(tmp_path.iterdir()) == [store.path("integers")]

@@ -7,11 +7,11 @@ import pytest
 
 from cz_gym import Parameters
 from cz_gym.config import make_config
-from cz_gym.machine.export.compiled import CompiledBlock
-from cz_gym.machine.export.controllers import make_block
-from cz_gym.machine.export.ports import OUTPUTS
-from cz_gym.machine.identify import identify, read_log
-from cz_gym.machine.puller import PullerFile
+from cz_gym.puller.file import PullerFile
+from cz_gym.tools.export.block import OUTPUTS
+from cz_gym.tools.export.controllers import make_block
+from cz_gym.tools.export.text import CompiledBlock
+from cz_gym.tools.identify import identify, read_log
 from studies.identify import wrong
 from tests.foreign_puller import SLOW, ZONE, ForeignPuller, Operator, drive, write_log
 

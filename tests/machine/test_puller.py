@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from cz_gym import SCENARIOS, CzVectorEnv, decode, make_puller
 from cz_gym.config import Config, make_config
-from cz_gym.differentiable import DifferentiableBatch
+from cz_gym.engine.tangents import DifferentiableBatch
 from cz_gym.env import CzEnv
+from cz_gym.episodes.adapt import adapt_scenario
 from cz_gym.episodes.scenarios import ALL, HARD, PULLER, RANDOMIZED
-from cz_gym.errors import CzError
-from cz_gym.machine import describe
-from cz_gym.machine.adapt import adapt_scenario
-from cz_gym.machine.puller import (
+from cz_gym.physics.parameters import Parameters, Recipe
+from cz_gym.physics.quantities import MACHINE
+from cz_gym.puller.file import (
     DEFAULT,
     FOLDER,
     PullerFile,
@@ -27,9 +27,9 @@ from cz_gym.machine.puller import (
     value_of,
     write_puller,
 )
-from cz_gym.physics.parameters import Parameters, Recipe
-from cz_gym.physics.quantities import MACHINE
+from cz_gym.support.errors import CzError
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
+from cz_gym.tools import puller as describe
 from tests.observed import PLAIN
 
 SHIPPED = sorted(path.stem for path in FOLDER.glob("*.toml"))

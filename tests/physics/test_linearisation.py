@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from cz_gym import make_puller
-from cz_gym.body.linearisation import linearise, radius_model
-from cz_gym.body.plant import NO_DISTURBANCE, Inputs, State, rates
+from cz_gym.body.process import linearise, radius_model
 from cz_gym.physics.meniscus import HURLE
+from cz_gym.physics.plant import NO_DISTURBANCE, State, rates
+from cz_gym.process import Inputs
 from cz_gym.support.units import MM
 
 

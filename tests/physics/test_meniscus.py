@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from cz_gym import make_puller
-from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.physics.meniscus import hurle_height, hurle_ring_offset, hurle_slope, profile, profile_scale, ring_point
+from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN
 
 PULLER = make_puller()
 

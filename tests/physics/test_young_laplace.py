@@ -12,9 +12,9 @@ from scipy.optimize import newton
 from scipy.special import k0e, k1e
 
 from cz_gym import Parameters, make_puller
-from cz_gym.body.linearisation import radius_model
-from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN
+from cz_gym.body.process import radius_model
 from cz_gym.physics.meniscus import HURLE, profile, ring_point
+from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 
 PULLER = make_puller()

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from cz_gym import CzEnv
-from cz_gym.baselines.registry import find_controller
-from cz_gym.body.plant import make_puller
-from cz_gym.commands import play
 from cz_gym.config import make_config
+from cz_gym.physics.plant import make_puller
 from cz_gym.rendering import canvas
+from cz_gym.tools import play
+from cz_gym.tools.registry import find_controller
 
 pygame = pytest.importorskip("pygame")
 gymnasium_play = pytest.importorskip("gymnasium.utils.play")

@@ -16,19 +16,18 @@ import pytest
 
 from cz_gym import agents
 from cz_gym.agents import shipped_names
-from cz_gym.agents.agent_file.contract import write_agent
-from cz_gym.baselines.registry import CONTROLLERS
-from cz_gym.commands import benchmark
+from cz_gym.agents.contract import write_agent
 from cz_gym.config import make_config
-from cz_gym.errors import CzError
-from cz_gym.evaluation import runner
-from cz_gym.evaluation.files import check_targets
 from cz_gym.evaluation.metrics import metric_names
-from cz_gym.evaluation.processes import through
+from cz_gym.evaluation.parallel import through
 from cz_gym.evaluation.protocol import CASES, TEST_SEEDS, find_case
-from cz_gym.observation import OBSERVATIONS
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+from cz_gym.spaces import OBSERVATIONS
+from cz_gym.support.errors import CzError
+from cz_gym.tools import benchmark, run
+from cz_gym.tools.files import check_targets
+from cz_gym.tools.registry import CONTROLLERS
 from tests.contracts import LINEAR, facts, model_of
 from tests.observed import PLAIN
 from tests.processes import python
@@ -66,7 +65,7 @@ def no_work(monkeypatch):
     def refuse(*arguments):
         raise AssertionError("work was done")
 
-    monkeypatch.setattr(runner, "rollout", refuse)
+    monkeypatch.setattr(run, "rollout", refuse)
 
 
 @pytest.fixture
@@ -140,7 +139,7 @@ def test_whole_crystals_are_quoted_in_two_pages(crystals, tmp_path, monkeypatch)
 @pytest.mark.slow
 def test_processes_side_by_side_find_the_same(finished, tmp_path, monkeypatch):
     """All but the time in the policies, which is measured."""
-    monkeypatch.setattr(runner, "LONG", 0)
+    monkeypatch.setattr(run, "LONG", 0)
     agents = [f"--agent={finished.parent / f'{seed}.onnx'}" for seed in (3, 8)]
     assert benchmark.main([*SMALL, "--out", str(tmp_path / "apart"), "--quiet", *agents]) == 0
     for file in ("episodes.csv", "crystal.png"):
@@ -339,18 +338,18 @@ def test_everything_of_a_benchmark_passes_to_other_processes_as_a_value(method, 
     own = [part for name in ("Still", "still", "made") for part in ("--controller", f"mine.py:{name}")]
     arguments = benchmark.parse([*own, "--scenario", "mine.py:later", "--controllers", "paper-tuned,lqg,ppo"])
     (row,) = benchmark.cases_of(arguments)
-    tasks = [runner.Task(each, row, 1, tmp_path) for each in benchmark.contenders_of(arguments, [row])]
+    tasks = [run.Task(each, row, 1, tmp_path) for each in benchmark.contenders_of(arguments, [row])]
     monkeypatch.chdir("/")
     with ProcessPoolExecutor(1, get_context(method)) as pool:
         found = dict(through(pool, values, tasks))
     for number, task in enumerate(tasks):
-        sample = runner.measure(task, lambda steps: None)
+        sample = run.measure(task, lambda steps: None)
         np.testing.assert_array_equal(found[number], sample.values)
     assert pickle.loads(pickle.dumps([*CONTROLLERS, *CASES]))[-len(CASES) :] == [*CASES]
 
 
 def values(task):
-    return runner.measure(task, lambda steps: None).values
+    return run.measure(task, lambda steps: None).values
 
 
 def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(tmp_path, monkeypatch):

@@ -13,10 +13,10 @@ from tests.processes import ROOT, python
 PROGRAMS = ("benchmark", "train", "cz_gym_command")
 ABOVE = ("studies", "examples", "tests", *PROGRAMS)
 FORBIDDEN = {
-    "cz_gym": ("cz_gym.baselines", "cz_gym.agents", "cz_gym.commands", *ABOVE),
-    "cz_gym.baselines": ("cz_gym.agents", "cz_gym.commands", *ABOVE),
-    "cz_gym.agents": ("cz_gym.baselines", "cz_gym.commands", *ABOVE),
-    "cz_gym.commands": ABOVE,
+    "cz_gym": ("cz_gym.baselines", "cz_gym.agents", "cz_gym.tools", *ABOVE),
+    "cz_gym.baselines": ("cz_gym.agents", "cz_gym.tools", *ABOVE),
+    "cz_gym.agents": ("cz_gym.baselines", "cz_gym.tools", *ABOVE),
+    "cz_gym.tools": ABOVE,
     "studies": ("tests", *PROGRAMS),
 }
 """Packages, and what nothing in each may import."""
@@ -100,7 +100,7 @@ def test_nothing_is_imported_from_above(package):
 def test_importing_loads_nothing_that_is_not_needed_and_no_module_has_a_second_name():
     loads = "import sys, {}; assert not {} & set(sys.modules)"
     code = [loads.format("cz_gym", {"cz_gym.physics.young_laplace"})]
-    code += [loads.format("cz_gym.commands.play", {"torch", "pygame", "PIL", "onnxruntime"})]
+    code += [loads.format("cz_gym.tools.play", {"torch", "pygame", "PIL", "onnxruntime"})]
     for name in ("baselines", "agents"):
         code += [f"import cz_gym.{name}", f"try: import {name}.anything", "except ImportError as error: print(error)"]
     told = python("-W", "error", "-c", "\n".join(code))

@@ -27,7 +27,7 @@ UNPACKED = {"build", "dist", "runs", "results", "venv", "__pycache__"}
 """Folders that no build needs, beside the hidden ones."""
 NAMES = """
 import importlib, sys
-for name in ("cz_gym", "cz_gym.baselines.registry", "cz_gym.agents.agent_file.contract"):
+for name in ("cz_gym", "cz_gym.tools.registry", "cz_gym.agents.contract"):
     print(importlib.import_module(name).__file__)
 assert "cz_gym.baselines" in sys.modules
 assert not {"baselines", "agents"} & set(sys.modules)
@@ -41,7 +41,7 @@ for _ in range(20):
     observation, *_ = env.step(env.action_space.sample())
 assert np.isfinite(observation).all()
 from cz_gym.baselines import CompensatedPID
-import cz_gym.baselines.analysis.compensator_design
+import cz_gym.baselines.analysis
 batch = gym.make_vec("Cz-v0", num_envs=2, vectorization_mode="vector_entry_point")
 batch.reset(seed=1)
 assert CompensatedPID().predict(batch.step(np.zeros((2, 2)))[0])[0].shape == (2, 2)
@@ -190,7 +190,7 @@ def test_environment_and_baselines_need_neither_torch_nor_plots():
     python("-W", "error", "-c", ABSENT.replace("{absent}", repr(absent)) + SMOKE, cwd=ROOT)
 
 
-@pytest.mark.parametrize("command", ["train.py", "benchmark.py", "-m studies.bode", "-m cz_gym.datasets"])
+@pytest.mark.parametrize("command", ["train.py", "benchmark.py", "-m studies.bode", "-m cz_gym.tools.datasets"])
 def test_outside_the_virtual_environment_one_line_says_so(command):
     line = [sys.executable, "-S", *command.split()]
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, env={"PATH": os.environ["PATH"]})
@@ -216,12 +216,12 @@ def plain(name):
 
 USES = {
     "benchmark": "run('benchmark --controllers paper --scenarios nominal --episodes 1 --quiet --out', out)",
-    "agents": "import cz_gym.agents.training.fleet, cz_gym.agents.apg, cz_gym.agents.export, cz_gym.agents.asymmetric",
+    "agents": "import cz_gym.agents.train, cz_gym.agents.apg, cz_gym.agents.export, cz_gym.agents.asymmetric",
     "render": "import gymnasium; e = gymnasium.make('cz_gym:Cz-v0', render_mode='rgb_array'); e.reset(); e.render()",
     "mpc": "from examples.mpc import mpc; import cz_gym.config as c; mpc(c.make_config('nominal')).programme",
     "data": "run('data --policies paper --scenarios nominal --episodes 1 --out', out)",
-    "cluster": "import cz_gym.evaluation.cluster as c, distributed; distributed.Client; c.versions()",
-    "plant": "import cz_gym.machine.serve.command; run('export --plant --to fmu --out', out)",
+    "cluster": "import cz_gym.evaluation.parallel as c, distributed; distributed.Client; c.versions()",
+    "plant": "import cz_gym.tools.serve.command; run('export --plant --to fmu --out', out)",
 }
 """What a user of each extra does with it."""
 
@@ -269,7 +269,7 @@ def test_the_wheel_holds_one_package_and_what_it_needs(source, tmp_path):
         kept = {name.partition("/")[2] for name in archive.getnames()}
     assert {"Makefile", "train.py", "studies/paper/__main__.py", "tests/conftest.py", "CITATION.cff"} <= kept
     home = tmp_path / "installed" / "cz_gym"
-    modules = [home / "__init__.py", home / "baselines/registry.py", home / "agents/agent_file/contract.py"]
+    modules = [home / "__init__.py", home / "cz_gym/tools/registry.py", home / "agents/contract.py"]
     assert printed(NAMES, home.parent, tmp_path) == list(map(str, modules))
     script = str(ROOT / "tests" / "golden" / "digest.py")
     code = f"{SMOKE}\nimport runpy\nrunpy.run_path({script!r}, run_name='__main__')"
@@ -282,5 +282,5 @@ def test_an_editable_install_finds_the_folders_beside_the_package(source, tmp_pa
     python("-c", code, cwd=source)
     with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as archive:
         archive.extractall(tmp_path / "installed")
-    modules = ["cz_gym/__init__.py", "baselines/registry.py", "agents/agent_file/contract.py"]
+    modules = ["cz_gym/__init__.py", "cz_gym/tools/registry.py", "agents/contract.py"]
     assert printed(NAMES, tmp_path / "installed", tmp_path) == [str(source / name) for name in modules]

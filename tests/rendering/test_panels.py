@@ -5,13 +5,13 @@ import pytest
 from scipy.integrate import trapezoid
 
 from cz_gym import HURLE, CzEnv, Parameters, make_puller
-from cz_gym.crystal_env import CzCrystalEnv
+from cz_gym.env import CzCrystalEnv
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.rendering import palette, triple_point
+from cz_gym.rendering import canvas
+from cz_gym.rendering import picture as triple_point
 from cz_gym.rendering.canvas import Canvas
-from cz_gym.rendering.picture import MARGINS, error_range, layout
-from cz_gym.rendering.record import Ending
+from cz_gym.rendering.picture import MARGINS, Ending, error_range, layout
 from cz_gym.support.units import MM
 
 pygame = pytest.importorskip("pygame")
@@ -54,10 +54,10 @@ def test_a_whole_crystals_scale_follows_its_crown():
         frame, record = grown(steps, kind=CzCrystalEnv, action="direct", scenario="nominal")
         scale = triple_point.scale_of(PANELS.triple_point, record)
         assert scale.x(0.0) == PANELS.triple_point.x
-        assert near(frame[round(scale.y_0) - 1], palette.MELT).any()
+        assert near(frame[round(scale.y_0) - 1], canvas.MELT).any()
         row, (r_c, _, z) = round(scale.y(record.last("h_c") + 5 * MM)), record.surface()
         edge = np.interp((scale.y_0 - (row + 0.5)) / scale.per_metre, z, r_c)
-        check_near(near(frame[row], palette.TRUE), scale.x(edge), 8)
+        check_near(near(frame[row], canvas.TRUE), scale.x(edge), 8)
         widths.append(scale.per_metre)
         assert abs(record.camera_error[-1] - record.error[-1]) < 2 * MM
     assert widths[0] > 2.0 * widths[1]
@@ -81,7 +81,7 @@ def test_the_drawn_surface_is_the_logged_radius(picture):
     frame, record = picture
     scale = triple_point.scale_of(PANELS.triple_point, record)
     r_c, _, z = record.surface()
-    blue = near(frame, palette.TRUE)
+    blue = near(frame, canvas.TRUE)
     rows = range(round(PANELS.triple_point.y) + 8, round(scale.y(z[0])) - 8)
     for row in rows:
         check_near(blue[row], scale.x(np.interp((scale.y_0 - (row + 0.5)) / scale.per_metre, z, r_c)), 12)
@@ -94,7 +94,7 @@ def test_the_rings_mark_is_at_the_rings_radius(pull, r_0):
     frame, record = grown(60, pull=pull, parameters=Parameters(r_0=r_0))
     scale = triple_point.scale_of(PANELS.triple_point, record)
     # In the melt, where the mark's line goes down from the ring.
-    check_near(near(frame, palette.CAMERA)[round(scale.y_0 + 34)], scale.x(record.last("r_br")), 8)
+    check_near(near(frame, canvas.CAMERA)[round(scale.y_0 + 34)], scale.x(record.last("r_br")), 8)
 
 
 def test_the_chart_ends_at_the_true_error(picture):
@@ -102,7 +102,7 @@ def test_the_chart_ends_at_the_true_error(picture):
     plot = PANELS.chart.inner(*MARGINS)
     x = round(plot.x + record.t[-1] / record.config.horizon * plot.w)
     y = plot.y + plot.h / 2 - record.error[-1] / error_range(record.error) * plot.h / 2
-    check_near(near(frame, palette.TRUE)[:, x : x + 3].any(axis=1), y, 8)
+    check_near(near(frame, canvas.TRUE)[:, x : x + 3].any(axis=1), y, 8)
 
 
 @pytest.mark.parametrize(("model", "tolerance"), [(HURLE, 1e-6), (YOUNG_LAPLACE, 0.3 * MM)], ids=["hurle", "exact"])
@@ -131,4 +131,4 @@ def test_the_picture_of_a_failed_crystal_has_a_band_that_says_so(pull, ending):
     frame, record = grown(900, pull=pull, scenario="nominal", model="II")
     assert record.ending is ending
     box = PANELS.triple_point
-    assert near(frame, palette.ALARM, 5.0)[round(box.y) : round(box.y) + 30].sum() > 0.3 * 20 * box.w
+    assert near(frame, canvas.ALARM, 5.0)[round(box.y) : round(box.y) + 30].sum() > 0.3 * 20 * box.w

@@ -10,10 +10,10 @@ import argparse
 from dataclasses import replace
 
 from cz_gym.config import make_config
+from cz_gym.env import CzVectorEnv
 from cz_gym.episodes.scenario import Interface
 from cz_gym.episodes.scenarios import HARD, PULLER, SCENARIOS
 from cz_gym.support.units import MM
-from cz_gym.vector import CzVectorEnv
 
 from .adversaries import KINDS, Adversaries
 from .checks import Broken, Watch

@@ -5,13 +5,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.action import HEATER_RANGE
-from cz_gym.body.cost import Cost
-from cz_gym.body.plant import fourth_power
-from cz_gym.body.signals import Logged
-from cz_gym.body.task import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT
-from cz_gym.episodes.schedule import melt_left
-from cz_gym.observation import CLIP
+from cz_gym.body.signals import Cost, Logged
+from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT, fourth_power
+from cz_gym.physics.schedule import melt_left
+from cz_gym.spaces import CLIP, HEATER_RANGE
 
 Array = npt.NDArray[Any]
 COLDEST, HOTTEST = 1000.0, 2600.0

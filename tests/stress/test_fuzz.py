@@ -17,9 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
-from cz_gym.agents.agent_file.contract import make_contract, read_agent
-from cz_gym.agents.training.checkpoint import PROGRESS, load_checkpoint, restore, to_bytes
-from cz_gym.agents.training.run_files import COLUMNS, read_rows, read_settings
+from cz_gym.agents.contract import make_contract, read_agent
+from cz_gym.agents.train import PROGRESS, load_checkpoint, read_rows, read_settings, restore, to_bytes
+from cz_gym.agents.validation import COLUMNS
 
 SPARE = 1_000_000_000
 """Memory beyond what is used already [bytes]."""

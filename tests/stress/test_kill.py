@@ -15,23 +15,23 @@ from dataclasses import replace
 import pytest
 from tqdm import tqdm
 
-from cz_gym.agents import OnnxPolicy
-from cz_gym.agents.training import run, validation
-from cz_gym.agents.training.checkpoint import load_checkpoint
-from cz_gym.agents.training.recipes import RECIPES
-from cz_gym.commands import train
+from cz_gym.agents import OnnxPolicy, validation
+from cz_gym.agents import train as run
+from cz_gym.agents.recipes import RECIPES
+from cz_gym.agents.train import load_checkpoint
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
-from cz_gym.support.atomic_files import write_files
+from cz_gym.support.files import write_files
+from cz_gym.tools import train
 from tests.small_learners import QUICK
 
 FRESH = multiprocessing.get_context("forkserver")
 FRESH.set_forkserver_preload(["tests.stress.test_kill"])
-RUN = "cz_gym.agents.training.run:Run"
+RUN = "cz_gym.agents.train:Run"
 PHASES = {
     "rollout": ("stable_baselines3.common.buffers:RolloutBuffer.add:20", 1280),
     "update": ("stable_baselines3:PPO.train:1>torch.nn.utils:clip_grad_norm_:5", 3328),
     "checkpoint, before it counts": (f"{RUN}.save:5>os:replace:1", 3584),
-    "first validation": (f"{RUN}.validate:1>cz_gym.vector:CzVectorEnv.step:100", 7616),
+    "first validation": (f"{RUN}.validate:1>cz_gym.env:CzVectorEnv.step:100", 7616),
     "one after a validation, before it counts": (f"{RUN}.validate:1>os:replace:1", 9664),
     "checkpoint, as it moves": (f"{RUN}.validate:1>os:replace:2", 9664),
     "summary, as it moves": (f"{RUN}.finish:1>os:replace:2", 9664),

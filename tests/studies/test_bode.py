@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from cz_gym.baselines.analysis.frequency import loop_margins
-from cz_gym.body.plant import make_puller
-from cz_gym.observation import PULL_SCALE
+from cz_gym.baselines.analysis import loop_margins
+from cz_gym.physics.plant import make_puller
+from cz_gym.process import PULL_SCALE
 from cz_gym.support.units import MM
 from studies import bode
 

@@ -9,8 +9,8 @@ from scipy.signal import lfilter
 
 from cz_gym import make_puller
 from cz_gym.baselines import CompensatedPID
-from cz_gym.baselines.pid.compensated_pid import SeriesPID
-from cz_gym.body.linearisation import radius_model
+from cz_gym.baselines.pid import SeriesPID
+from cz_gym.body.process import radius_model
 from studies.paper import __main__ as paper
 from studies.paper.experiments import BARE, errors, inverse_response, pull_change, ramp, ramp_numbers, trace
 from studies.paper.figures import FIGURES

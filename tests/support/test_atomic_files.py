@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
-from cz_gym.errors import CzError
-from cz_gym.support import atomic_files
-from cz_gym.support.atomic_files import LOCK, check_writable, locked, naming, write_files
+from cz_gym.support import files
+from cz_gym.support.errors import CzError
+from cz_gym.support.files import LOCK, check_writable, locked, naming, write_files
 from tests.processes import python
 
 KILL_AT_EVERY_LINE = """
@@ -69,7 +69,7 @@ def test_a_full_disk_leaves_what_was_there_and_names_the_file(tmp_path, monkeypa
 
     write_files({tmp_path / "a": b"old"})
     with monkeypatch.context() as patch:
-        patch.setattr(atomic_files.os, call, full)
+        patch.setattr(files.os, call, full)
         with pytest.raises(CzError, match=rf"^{tmp_path / 'a'}: No space left"):
             write_files({tmp_path / "a": b"new", tmp_path / "b": b"new"})
     assert (tmp_path / "a").read_bytes() == b"old"
@@ -98,7 +98,7 @@ def test_a_file_that_cannot_be_read_is_named_with_the_reason(tmp_path):
 
 @pytest.mark.slow
 def test_a_folder_is_used_by_one_process(tmp_path):
-    code = "from cz_gym.support.atomic_files import locked\nwith locked(Path(sys.argv[1])): pass"
+    code = "from cz_gym.support.files import locked\nwith locked(Path(sys.argv[1])): pass"
     code = f"import sys; from pathlib import Path; {code}"
     with locked(tmp_path / "new"):
         with pytest.raises(CzError, match="another process is at work"), locked(tmp_path / "new"):

@@ -12,10 +12,10 @@ import pytest
 from gymnasium.error import DependencyNotInstalled
 
 import cz_gym_command
-from cz_gym import __version__, datasets
-from cz_gym.commands import benchmark, play, tune
-from cz_gym.errors import CzError
+from cz_gym import __version__
 from cz_gym.support.command_line import OPTIONAL, guarded
+from cz_gym.support.errors import CzError
+from cz_gym.tools import benchmark, datasets, play, tune
 from studies import speed
 from studies.paper import __main__ as paper
 from tests.processes import python

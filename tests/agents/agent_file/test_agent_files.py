@@ -8,9 +8,9 @@ import onnx
 import pytest
 
 from cz_gym.agents import AgentFileError, OnnxPolicy
-from cz_gym.agents.agent_file.contract import MAX_BYTES, write_agent
+from cz_gym.agents.contract import MAX_BYTES, write_agent
 from cz_gym.agents.export import to_onnx
-from cz_gym.observation import HISTORY
+from cz_gym.spaces import HISTORY
 from tests.contracts import facts
 
 

@@ -8,10 +8,10 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper, parser
 
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
-from cz_gym.agents.agent_file.contract import make_contract, read_agent
-from cz_gym.agents.agent_file.graph import MAX_ACTIVATIONS, MAX_NODES, OPERATORS, checked
+from cz_gym.agents.contract import make_contract, read_agent
+from cz_gym.agents.graph import MAX_ACTIVATIONS, MAX_NODES, OPERATORS, checked
 from cz_gym.config import make_config
-from cz_gym.observation import MEASURED
+from cz_gym.spaces import MEASURED
 from tests import contracts
 from tests.contracts import LINEAR, facts, graph_of, value
 from tests.processes import python

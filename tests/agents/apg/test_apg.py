@@ -5,14 +5,13 @@ import pytest
 import torch
 from stable_baselines3.common.env_util import make_vec_env as scalar_environments
 
-from cz_gym.agents.apg import APG
-from cz_gym.agents.apg.plant_step import StepCost, advance
-from cz_gym.body.cost import SCALES, WEIGHTS, saturated
+from cz_gym.agents.apg import APG, StepCost, advance
+from cz_gym.body.signals import SCALES, WEIGHTS, saturated
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.differentiable import STATES, DifferentiableBatch
-from cz_gym.errors import CzError
+from cz_gym.engine.tangents import STATES, DifferentiableBatch
 from cz_gym.sb3 import make_vec_env
+from cz_gym.support.errors import CzError
 
 SETTINGS = {"observation": "measured", "action": "rate"}
 CONFIG = make_config(**SETTINGS)

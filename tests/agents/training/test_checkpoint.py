@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from cz_gym.agents import AgentFileError
-from cz_gym.agents.training.algorithms import make_algorithm
-from cz_gym.agents.training.checkpoint import load_checkpoint, restore, to_bytes
+from cz_gym.agents.recipes import make_algorithm
+from cz_gym.agents.train import load_checkpoint, restore, to_bytes
 from tests.small_learners import SMALL, SMALL_APG, SMALL_SAC, learned, trained
 
 

@@ -7,10 +7,11 @@ from dataclasses import replace
 import pytest
 from tqdm import tqdm
 
-from cz_gym.agents import AgentFileError
-from cz_gym.agents.training import fleet, run, validation
-from cz_gym.agents.training.recipes import RECIPES
-from cz_gym.commands import train
+from cz_gym.agents import AgentFileError, validation
+from cz_gym.agents import train as fleet
+from cz_gym.agents import train as run
+from cz_gym.agents.recipes import RECIPES
+from cz_gym.tools import train
 from tests.small_learners import QUICK, REFERENCES, train_small_seed
 
 pytestmark = pytest.mark.usefixtures("few_crystals")

@@ -12,12 +12,12 @@ import pytest
 import torch
 
 from cz_gym.agents import AgentFileError, OnnxPolicy, load
-from cz_gym.agents.training import run
-from cz_gym.agents.training.checkpoint import load_checkpoint
-from cz_gym.agents.training.recipes import CRYSTAL_RECIPES, RECIPES
-from cz_gym.commands import train
+from cz_gym.agents import train as run
+from cz_gym.agents.recipes import CRYSTAL_RECIPES, RECIPES
+from cz_gym.agents.train import load_checkpoint
 from cz_gym.config import make_config
 from cz_gym.support.command_line import interpreter
+from cz_gym.tools import train
 from tests.small_learners import QUICK
 
 ALONG = {name: getattr(CRYSTAL_RECIPES["ppo"], name) for name in ("environment", "stages", "scenario")}

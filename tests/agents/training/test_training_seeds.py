@@ -4,8 +4,7 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from cz_gym.agents.training.algorithms import make_algorithm
-from cz_gym.agents.training.recipes import RECIPES
+from cz_gym.agents.recipes import RECIPES, make_algorithm
 
 
 @pytest.mark.parametrize("name", ["ppo", "sac"])

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from cz_gym import CzEnv
-from cz_gym.agents.training import validation
-from cz_gym.agents.training.recipes import PPO
-from cz_gym.baselines.registry import make_controller
+from cz_gym.agents import validation
+from cz_gym.agents.recipes import PPO
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.tools.registry import make_controller
 
 SEEDS = range(1_000_000, 1_000_006)
 

@@ -7,9 +7,9 @@ import pytest
 from scipy.signal import invres, residue
 
 from cz_gym import make_puller
-from cz_gym.baselines.analysis.compensator_design import design_compensator, margins
-from cz_gym.body.linearisation import radius_model
-from cz_gym.errors import CzError
+from cz_gym.baselines.analysis import design_compensator, margins
+from cz_gym.body.process import radius_model
+from cz_gym.support.errors import CzError
 from studies.paper.experiments import COMPENSATOR, MODEL_I, MODEL_II, PID
 
 

@@ -10,22 +10,30 @@ import pytest
 
 from cz_gym import make_puller
 from cz_gym.baselines import OpenLoop
-from cz_gym.baselines.analysis.compensator_design import controller_transfer
-from cz_gym.baselines.analysis.frequency import loop_margins, opened, response
-from cz_gym.baselines.analysis.linear_form import linear_form
-from cz_gym.baselines.analysis.sampled_loop import HOT_ZONE, NotLinearError, close, linear_controller, stable_range
-from cz_gym.baselines.pid.compensated_pid import CompensatedPID
-from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.registry import make_controller
-from cz_gym.baselines.tuning.lqg import FAMILY
-from cz_gym.body.linearisation import radius_model
+from cz_gym.baselines.analysis import (
+    HOT_ZONE,
+    NotLinearError,
+    close,
+    controller_transfer,
+    linear_controller,
+    linear_form,
+    loop_margins,
+    opened,
+    response,
+    stable_range,
+)
+from cz_gym.baselines.pid import CompensatedPID, FilteredPID
+from cz_gym.baselines.tuned_lqg import FAMILY
+from cz_gym.body.process import radius_model
+from cz_gym.body.signals import Measured
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Scenario, Sensor
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.observation import MEASURED, Measured
-from cz_gym.physics.linearisation import StateSpace
+from cz_gym.physics.numerics import StateSpace
 from cz_gym.physics.parameters import Parameters
+from cz_gym.spaces import MEASURED
 from cz_gym.support.units import MM
+from cz_gym.tools.registry import make_controller
 from tests.observed import PLAIN
 from tests.samples import NOMINAL_LQG
 

@@ -7,21 +7,19 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from cz_gym.baselines.bounds import trajectory
-from cz_gym.baselines.bounds.clairvoyant import Clairvoyant
-from cz_gym.baselines.bounds.future import future_of
-from cz_gym.baselines.bounds.trajectory import Limits, limits_of, mean_pull, optimise
-from cz_gym.body.cost import Cost, cost_terms
-from cz_gym.body.plant import Inputs, State
+from cz_gym.baselines import clairvoyant
+from cz_gym.baselines.clairvoyant import Clairvoyant, Limits, future_of, limits_of, mean_pull, optimise
+from cz_gym.body.signals import Cost, cost_terms
 from cz_gym.config import make_config
+from cz_gym.env import CzVectorEnv
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.episodes.scenarios import HARD, RANDOMIZED
-from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
-from cz_gym.evaluation.replay import Playback
-from cz_gym.evaluation.rollout import rollout
+from cz_gym.evaluation.rollout import Playback, rollout
+from cz_gym.physics.plant import State
+from cz_gym.process import Inputs
+from cz_gym.support.errors import CzError
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
-from cz_gym.vector import CzVectorEnv
 
 SEEDS = (1_000_000, 1_000_001, 1_000_002)
 
@@ -157,7 +155,7 @@ def test_the_clairvoyant_refuses_to_act_on_other_slots():
 
 def test_an_optimum_that_was_not_reached_is_no_bound(monkeypatch):
     config = make_config("randomized", observation="state", horizon=300.0, action="direct")
-    monkeypatch.setattr(trajectory, "MOST_STEPS", 3)
+    monkeypatch.setattr(clairvoyant, "MOST_STEPS", 3)
     future = future_of(config, SEEDS)
     limits = limits_of(config.scenario.actuators, config.ranges, config.control_interval)
     assert not optimise(future, limits).converged.all()

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from cz_gym import CzVectorEnv, make_puller
-from cz_gym.baselines.bounds import lqg as lqg_bounds
-from cz_gym.baselines.bounds.future import fluctuations_of, pullers_of
-from cz_gym.baselines.lqg.controller import LQG, LQGDesign
-from cz_gym.baselines.lqg.model import plant_model
-from cz_gym.baselines.registry import find_controller
+from cz_gym.baselines import lqg_bounds
+from cz_gym.baselines.clairvoyant import fluctuations_of, pullers_of
+from cz_gym.baselines.lqg import LQG, LQGDesign
+from cz_gym.baselines.lqg_filter import plant_model
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.support.units import HOUR
+from cz_gym.tools.registry import find_controller
 from tests.observed import PLAIN, observations
 
 PULLER = make_puller(lam=0.5)

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from cz_gym.baselines.crystal.lqg import STATES, Noise, Weights, design, without_ring
-from cz_gym.baselines.registry import CRYSTAL_CONTROLLERS, make_controller
-from cz_gym.baselines.tuning.crystal import CRYSTALS
-from cz_gym.baselines.tuning.values import by_scenario, with_values
+from cz_gym.baselines.crystal import STATES, Noise, Weights, design, without_ring
+from cz_gym.baselines.tuned import by_scenario, with_values
+from cz_gym.baselines.tuned_crystal import CRYSTALS
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.errors import CzError
-from cz_gym.evaluation.crystal_metrics import crystal_metrics
+from cz_gym.evaluation.metrics import crystal_metrics
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, Case
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.meniscus import HURLE
+from cz_gym.support.errors import CzError
+from cz_gym.tools.registry import CRYSTAL_CONTROLLERS, make_controller
 
 CROWN = Case("crown", "randomized", "a crown", process=CRYSTAL, stage="crown")
 

@@ -5,19 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cz_gym.baselines.analysis.linear_form import linear_form
-from cz_gym.baselines.analysis.sampled_loop import close
-from cz_gym.baselines.bounds.future import pullers_of
-from cz_gym.baselines.lqg.controller import LQG, LQGDesign
-from cz_gym.baselines.lqg.multiple_model import Hypotheses, multiple_model_filter
-from cz_gym.baselines.registry import make_controller
-from cz_gym.baselines.tuning.lqg import FACTORS, adaptive
+from cz_gym.baselines.analysis import close, linear_form
+from cz_gym.baselines.clairvoyant import pullers_of
+from cz_gym.baselines.lqg import LQG, LQGDesign
+from cz_gym.baselines.lqg_estimator import Hypotheses, multiple_model_filter
+from cz_gym.baselines.tuned_lqg import FACTORS, adaptive
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.observation import decode
-from cz_gym.support.nested import map_arrays
+from cz_gym.spaces import decode
+from cz_gym.support.names import map_arrays
 from cz_gym.support.units import HOUR, MM
+from cz_gym.tools.registry import make_controller
 from tests.observed import PLAIN, Watched, measured
 from tests.samples import NOMINAL_LQG
 

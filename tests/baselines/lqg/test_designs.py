@@ -2,11 +2,11 @@
 
 import pytest
 
-from cz_gym.baselines.bounds.lqg import privileged
-from cz_gym.baselines.registry import CONTROLLERS, make_controller
-from cz_gym.baselines.tuning.lqg import FAMILY
+from cz_gym.baselines.lqg_bounds import privileged
+from cz_gym.baselines.tuned_lqg import FAMILY
 from cz_gym.config import make_config
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.tools.registry import CONTROLLERS, make_controller
 from tests.observed import PLAIN
 from tests.samples import NOMINAL_LQG
 

@@ -7,11 +7,9 @@ import pytest
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
 from cz_gym import make_puller
-from cz_gym.baselines.lqg.controller import LQG, LQGDesign, solve
-from cz_gym.baselines.lqg.model import PLANT, STATES, NoiseModel
-from cz_gym.baselines.lqg.regulator import PULL_SCALE
-from cz_gym.baselines.lqg.ring_model import RingModel
-from cz_gym.body.cost import coefficients
+from cz_gym.baselines.lqg import LQG, PULL_SCALE, LQGDesign, solve
+from cz_gym.baselines.lqg_filter import PLANT, STATES, NoiseModel, RingModel
+from cz_gym.body.signals import coefficients
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 from tests.observed import measured
 

@@ -7,15 +7,14 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from cz_gym import make_puller
-from cz_gym.baselines.lqg.controller import LQGDesign, solve
-from cz_gym.baselines.lqg.model import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, plant_model
-from cz_gym.baselines.lqg.regulator import look_ahead, quadratic_cost, regulator, samples_ahead
-from cz_gym.body.cost import Weights
-from cz_gym.body.plant import Disturbance, Inputs, State, hidden_load, rates
-from cz_gym.episodes.schedule import quintic
-from cz_gym.machine.puller import find_puller
-from cz_gym.observation import Measured
+from cz_gym.baselines.lqg import LQGDesign, look_ahead, quadratic_cost, regulator, samples_ahead, solve
+from cz_gym.baselines.lqg_filter import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, plant_model
+from cz_gym.body.signals import Measured, Weights
 from cz_gym.physics.meniscus import HURLE
+from cz_gym.physics.plant import Disturbance, State, hidden_load, rates
+from cz_gym.physics.schedule import quintic
+from cz_gym.process import Inputs
+from cz_gym.puller.file import find_puller
 
 PULLER = make_puller(lam=0.5)
 NOISE = NoiseModel()

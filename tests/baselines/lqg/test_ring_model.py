@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from cz_gym import make_puller
-from cz_gym.baselines.lqg import ring_model
-from cz_gym.baselines.lqg.controller import LQG, LQGDesign
-from cz_gym.baselines.lqg.model import STATES, NoiseModel, plant_model
-from cz_gym.baselines.lqg.ring_model import RingModel, frequencies, search_step
-from cz_gym.baselines.tuning.lqg import BEST_RETURN, ring_of
+from cz_gym.baselines import lqg_filter
+from cz_gym.baselines.lqg import LQG, LQGDesign
+from cz_gym.baselines.lqg_filter import STATES, NoiseModel, RingModel, frequencies, plant_model, search_step
+from cz_gym.baselines.tuned_lqg import BEST_RETURN, ring_of
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface, Scenario, Sensor
 from cz_gym.episodes.scenarios import PULLER as PULLER_SCENARIO
@@ -28,17 +27,17 @@ PULLER_RING = ring_of(PULLER_SCENARIO.sensor)
 @pytest.mark.parametrize("dt", [2.0, 5.0, 10.0])
 def test_a_ring_that_grows_evenly_is_delivered_as_old_as_the_latency(latency, dt):
     ring, slope, steps = RingModel(latency), 3e-7, 20
-    model = ring_model.augmented(plant_model(PULLER, NoiseModel(), dt), ring, dt)
+    model = lqg_filter.augmented(plant_model(PULLER, NoiseModel(), dt), ring, dt)
     row = np.zeros((1, len(model.A)))
     row[0, 0] = 1.0
-    A = ring_model.transition(np.eye(len(model.A)), row, np.zeros(1), ring, dt)[0]
+    A = lqg_filter.transition(np.eye(len(model.A)), row, np.zeros(1), ring, dt)[0]
     for state in range(ring.first_past, len(A)):
         A[state] = row[0] if state == ring.first_past else np.eye(len(A))[state - 1]
     x = np.zeros(len(A))
     for k in range(steps):
         x = A @ x
         x[0] = slope * (k + 1) * dt
-    delivered = ring_model.delivered_row(row, ring, dt)[0] @ x
+    delivered = lqg_filter.delivered_row(row, ring, dt)[0] @ x
     assert delivered == pytest.approx(slope * (steps * dt - latency), rel=1e-12)
 
 
@@ -58,7 +57,7 @@ def test_the_camera_of_the_environment_is_late_as_modelled(dt):
 
 def heard(tone_hz, amplitude, noise, samples, dt=5.0, slots=40, ring=PULLER_RING):
     rng = np.random.default_rng(6)
-    phase, search = rng.uniform(0.0, 2.0 * np.pi, slots), ring_model.search_at_rest(slots, ring, dt)
+    phase, search = rng.uniform(0.0, 2.0 * np.pi, slots), lqg_filter.search_at_rest(slots, ring, dt)
     for k in range(samples):
         rest = amplitude * np.sin(2.0 * np.pi * tone_hz * k * dt + phase) + noise * rng.normal(size=slots)
         search, _, ripple = search_step(search, rest, np.ones(slots, bool), ring, dt)
@@ -103,7 +102,7 @@ def test_a_ripple_that_was_identified_is_left_out_of_the_radius():
 
 def test_a_ring_that_is_neither_late_nor_shaken_adds_nothing():
     model = plant_model(PULLER, NoiseModel(), 5.0)
-    for plain, with_ring in zip(model, ring_model.augmented(model, RingModel(), 5.0), strict=True):
+    for plain, with_ring in zip(model, lqg_filter.augmented(model, RingModel(), 5.0), strict=True):
         np.testing.assert_allclose(with_ring, plain, rtol=1e-12, atol=1e-30)
     config = make_config("randomized", horizon=1200.0, **PLAIN)
     plain, with_ring = (rollout(LQG(design=LQGDesign(ring=ring)), config, [3]) for ring in (None, RingModel()))
@@ -111,7 +110,7 @@ def test_a_ring_that_is_neither_late_nor_shaken_adds_nothing():
 
 
 def test_the_ripple_keeps_its_variance():
-    model = ring_model.augmented(plant_model(PULLER, NoiseModel(), 5.0), PULLER_RING, 5.0)
+    model = lqg_filter.augmented(plant_model(PULLER, NoiseModel(), 5.0), PULLER_RING, 5.0)
     both = slice(len(STATES), len(STATES) + 2)
     A, Q = model.A[both, both], model.Q[both, both]
     np.testing.assert_allclose(A @ A.T * PULLER_RING.ripple_sd**2 + Q, PULLER_RING.ripple_sd**2 * np.eye(2), atol=1e-18)

@@ -8,18 +8,16 @@ import pytest
 from scipy.signal import lfilter
 
 from cz_gym import make_puller
-from cz_gym.action import HEATER_RANGE
-from cz_gym.baselines.analysis.frequency import loop_margins
-from cz_gym.baselines.analysis.linear_form import linear_form
-from cz_gym.baselines.pid.compensated_pid import CompensatedPID, SeriesPID
-from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.pid.temperature_loop import TemperatureLoop
-from cz_gym.baselines.tuning.pid import PIDS, below_half_the_zero
-from cz_gym.baselines.tuning.values import TUNED
-from cz_gym.body.linearisation import radius_model
+from cz_gym.baselines.analysis import linear_form, loop_margins
+from cz_gym.baselines.pid import CompensatedPID, FilteredPID, SeriesPID, TemperatureLoop
+from cz_gym.baselines.tuned import TUNED
+from cz_gym.baselines.tuned_pid import PIDS, below_half_the_zero
+from cz_gym.body.process import radius_model
+from cz_gym.body.signals import Measured
 from cz_gym.episodes.scenarios import RANDOMIZED
-from cz_gym.observation import MEASURED, PULL_SCALE, Measured
 from cz_gym.physics.parameters import Parameters
+from cz_gym.process import PULL_SCALE
+from cz_gym.spaces import HEATER_RANGE, MEASURED
 from cz_gym.support.units import MM, MM_PER_MIN
 from tests.observed import measured, pulls
 

@@ -9,25 +9,23 @@ import pytest
 
 from cz_gym import make_puller
 from cz_gym.agents import load
-from cz_gym.baselines.analysis.linear_form import linear_form
-from cz_gym.baselines.analysis.sampled_loop import close
-from cz_gym.baselines.pid.compensated_pid import CompensatedPID
-from cz_gym.baselines.registry import find_controller, make_controller
-from cz_gym.baselines.tuning import crystal
-from cz_gym.baselines.tuning.crystal import CRYSTALS, CrystalFigures
-from cz_gym.baselines.tuning.pid import PAPER_TUNED, PIDS, paper_here
-from cz_gym.baselines.tuning.record import Figures, value_at
-from cz_gym.baselines.tuning.scaling import scaled
-from cz_gym.commands import tune
-from cz_gym.commands.benchmark import main as benchmark
+from cz_gym.baselines import tuned_crystal
+from cz_gym.baselines.analysis import close, linear_form
+from cz_gym.baselines.pid import CompensatedPID
+from cz_gym.baselines.tuned import Figures, value_at
+from cz_gym.baselines.tuned_crystal import CRYSTALS, CrystalFigures
+from cz_gym.baselines.tuned_pid import PAPER_TUNED, PIDS, paper_here, scaled
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.episodes.scenarios import RANDOMIZED
-from cz_gym.errors import CzError
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.machine.puller import FOLDER, find_puller, write_puller
+from cz_gym.puller.file import FOLDER, find_puller, write_puller
+from cz_gym.support.errors import CzError
 from cz_gym.support.units import HOUR
+from cz_gym.tools import tune
+from cz_gym.tools.benchmark import main as benchmark
+from cz_gym.tools.registry import find_controller, make_controller
 from tests.observed import PLAIN
 
 WIDE = make_config(puller="silicon-300mm", **PLAIN)
@@ -140,7 +138,7 @@ def test_whole_crystals_of_a_puller_have_searches_of_their_own(tmp_path, monkeyp
     def figures(policy, config, seeds):
         return CrystalFigures(policy.control_interval, 0.5, 0.1, 0.01, 0.02)
 
-    monkeypatch.setattr(crystal, "measure", figures)
+    monkeypatch.setattr(tuned_crystal, "measure", figures)
     monkeypatch.setattr(tune, "side_by_side", lambda function, tasks, *_: enumerate(map(function, tasks)))
     assert tune.main(["--puller", str(place), "--trials", "14", "--env", "CzCrystal-v0"]) == 0
     assert "crown's largest errors 2.00 mm, tail's 0.50 mm, 2 % lost" in capsys.readouterr().out

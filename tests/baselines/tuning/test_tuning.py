@@ -6,21 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cz_gym.baselines.lqg.controller import LQGDesign
-from cz_gym.baselines.pid.filtered_pid import FilteredPID
-from cz_gym.baselines.tuning.crystal import CRYSTALS, SCENARIOS, STAGES, CrystalFigures, priced
-from cz_gym.baselines.tuning.lqg import ACTIVITIES, BEST_RETURN, FAMILY, LQGS, PARAMETERS, lqg_goal
-from cz_gym.baselines.tuning.pid import PIDS, pid_goal
-from cz_gym.baselines.tuning.record import Figures, Parameter, value_at
-from cz_gym.baselines.tuning.search import Search, measure
-from cz_gym.baselines.tuning.values import TUNED, by_scenario, file_name
-from cz_gym.commands import tune
+from cz_gym.baselines.lqg import LQGDesign
+from cz_gym.baselines.pid import FilteredPID
+from cz_gym.baselines.search import Search, measure
+from cz_gym.baselines.tuned import TUNED, Figures, Parameter, by_scenario, file_name, value_at
+from cz_gym.baselines.tuned_crystal import CRYSTALS, SCENARIOS, STAGES, CrystalFigures, priced
+from cz_gym.baselines.tuned_lqg import ACTIVITIES, BEST_RETURN, FAMILY, LQGS, PARAMETERS, lqg_goal
+from cz_gym.baselines.tuned_pid import PIDS, pid_goal
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
-from cz_gym.errors import CzError
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
-from cz_gym.machine.puller import FOLDER
+from cz_gym.puller.file import FOLDER
+from cz_gym.support.errors import CzError
+from cz_gym.tools import tune
 from tests.observed import PLAIN
 
 FIGURES = Figures(0.06, 0.01, 0.02, 0.0, 1900.0, 0.0, 2160)

@@ -4,16 +4,15 @@ from dataclasses import replace
 
 import pytest
 
-from cz_gym.baselines.lqg.ring_model import RingModel
-from cz_gym.baselines.registry import make_controller
-from cz_gym.baselines.tuning.lqg import BEST_RETURN, LQGS, ring_of
-from cz_gym.baselines.tuning.pid import PIDS
-from cz_gym.baselines.tuning.record import value_at
-from cz_gym.baselines.tuning.values import TUNED, by_scenario
+from cz_gym.baselines.lqg_filter import RingModel
+from cz_gym.baselines.tuned import TUNED, by_scenario, value_at
+from cz_gym.baselines.tuned_lqg import BEST_RETURN, LQGS, ring_of
+from cz_gym.baselines.tuned_pid import PIDS
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Sensor
 from cz_gym.episodes.scenarios import PULLER, RANDOMIZED, SCENARIOS, SENSOR_FAULT
 from cz_gym.support.units import MINUTE, MM
+from cz_gym.tools.registry import make_controller
 from tests.observed import PLAIN
 
 

@@ -8,15 +8,15 @@ import pytest
 from PIL import Image
 
 from cz_gym.baselines import OpenLoop
-from cz_gym.baselines.registry import CONTROLLERS
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metric_names
+from cz_gym.evaluation.plots import COLOURS, COLUMNS, DPI, chosen, styles_of
 from cz_gym.evaluation.protocol import find_case
-from cz_gym.evaluation.report.canvas import COLOURS, COLUMNS, DPI, chosen, styles_of
-from cz_gym.evaluation.report.figures import NAMED, draw_figures
-from cz_gym.evaluation.report.markdown import brief
 from cz_gym.evaluation.results import Sample, summarise
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.tools.registry import CONTROLLERS
+from cz_gym.tools.report.figures import NAMED, draw_figures
+from cz_gym.tools.report.markdown import brief
 from tests.observed import PLAIN
 from tests.samples import contender
 

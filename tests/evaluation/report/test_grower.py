@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cz_gym.baselines.analysis.frequency import loop_margins
-from cz_gym.baselines.analysis.linear_form import linear_form
-from cz_gym.baselines.registry import find_controller
-from cz_gym.body.plant import make_puller
-from cz_gym.commands import benchmark
+from cz_gym.baselines.analysis import linear_form, loop_margins
 from cz_gym.evaluation.protocol import find_case
-from cz_gym.evaluation.report import grower, tables
-from cz_gym.evaluation.report.markdown import markdown, terminal
-from cz_gym.evaluation.report.page import page
 from cz_gym.evaluation.results import Sample, summarise
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.machine.puller import find_puller
+from cz_gym.physics.plant import make_puller
+from cz_gym.puller.file import find_puller
+from cz_gym.tools import benchmark
+from cz_gym.tools.registry import find_controller
+from cz_gym.tools.report import markdown as grower
+from cz_gym.tools.report import tables
+from cz_gym.tools.report.markdown import markdown, terminal
+from cz_gym.tools.report.page import page
 
 NAMES = ("open-loop", "pid-conventional", "paper-tuned")
 ROW = replace(find_case("randomized"), puller=find_puller("silicon-300mm"), tolerance=0.4e-3)

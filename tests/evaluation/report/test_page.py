@@ -10,10 +10,9 @@ from bs4 import BeautifulSoup
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cz_gym.commands import benchmark
-from cz_gym.evaluation.report.page import page
-from cz_gym.evaluation.report.page_pictures import PANELS, crystal, pareto, plain
-from cz_gym.evaluation.report.tables import DRIVES, ERROR, comparison, overview
+from cz_gym.tools import benchmark
+from cz_gym.tools.report.page import PANELS, crystal, page, pareto, plain
+from cz_gym.tools.report.tables import DRIVES, ERROR, comparison, overview
 from tests.samples import result_of
 
 EVIL = "</script><img src=x onerror=alert(1)>\"'&amp;<b>\u2028%{x}|"

@@ -7,10 +7,10 @@ import numpy as np
 
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.evaluation.protocol import Case
-from cz_gym.evaluation.report import crystals, tables
-from cz_gym.evaluation.report.tables import FEWEST, best_of_each_kind, verdict
 from cz_gym.evaluation.results import Result, Sample
 from cz_gym.evaluation.statistics import Estimate
+from cz_gym.tools.report import crystals, tables
+from cz_gym.tools.report.tables import FEWEST, best_of_each_kind, verdict
 from tests.samples import contender
 
 BETTER, WORSE, EITHER = Estimate(-1.0, (-2.0, -0.5), 9), Estimate(1.0, (0.5, 2.0), 9), Estimate(0.1, (-1.0, 1.0), 9)

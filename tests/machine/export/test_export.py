@@ -12,20 +12,19 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cz_gym import CzEnv, agents
-from cz_gym.action import HEATER_RANGE, drives_of
-from cz_gym.baselines.registry import make_controller
+from cz_gym.body.signals import Measured
 from cz_gym.config import make_config
-from cz_gym.machine.export import controllers
-from cz_gym.machine.export.command import main
-from cz_gym.machine.export.compiled import CompiledBlock, memory_of
-from cz_gym.machine.export.controllers import identifier_of, make_block
-from cz_gym.machine.export.policy import BlockPolicy
-from cz_gym.machine.export.ports import INPUTS, Alarm, in_plant_units, in_shares, nominal_puller
-from cz_gym.machine.export.text import write_c, write_st
-from cz_gym.machine.export.vector import test_vector as vector_of
-from cz_gym.machine.identify.log import record_log
-from cz_gym.observation import DRIVE_CHANNELS, Measured, decode, readable
-from cz_gym.vector import CzVectorEnv
+from cz_gym.env import CzVectorEnv
+from cz_gym.spaces import DRIVE_CHANNELS, HEATER_RANGE, decode, drives_of, readable
+from cz_gym.tools.export import controllers
+from cz_gym.tools.export.block import INPUTS, Alarm, in_plant_units, in_shares, nominal_puller
+from cz_gym.tools.export.command import main
+from cz_gym.tools.export.controllers import identifier_of, make_block
+from cz_gym.tools.export.shell import BlockPolicy
+from cz_gym.tools.export.text import CompiledBlock, memory_of, write_c, write_st
+from cz_gym.tools.export.text import test_vector as vector_of
+from cz_gym.tools.identify.log import record_log
+from cz_gym.tools.registry import make_controller
 from studies.export import LARGEST, report, study
 from studies.faults import FAULTS, grow
 from tests.machine.export.structured_text import FunctionBlock

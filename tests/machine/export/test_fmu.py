@@ -8,11 +8,11 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from cz_gym import CzEnv
-from cz_gym.machine.export.command import main
-from cz_gym.machine.export.fmu import SHOWN, TRUTH
-from cz_gym.machine.export.ports import SETPOINTS, in_plant_units, in_shares, nominal_puller
-from cz_gym.observation import decode
+from cz_gym.spaces import decode
 from cz_gym.support.units import MM
+from cz_gym.tools.export.block import SETPOINTS, in_plant_units, in_shares, nominal_puller
+from cz_gym.tools.export.command import main
+from cz_gym.tools.export.fmu import SHOWN, TRUTH
 
 OUTPUT = ["growing", TRUTH.name, *SETPOINTS, *SETPOINTS.values()]
 

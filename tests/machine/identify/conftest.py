@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from cz_gym import CzEnv, Parameters
-from cz_gym.baselines.registry import find_controller
 from cz_gym.episodes.scenario import Pullers
 from cz_gym.episodes.scenarios import RANDOMIZED
-from cz_gym.machine.identify import Excited, Identified, identify, read_log, record_log
+from cz_gym.tools.identify import Excited, Identified, identify, read_log, record_log
+from cz_gym.tools.registry import find_controller
 
 TRUTH = Parameters()._replace(C_1=8e4, C_2=7.5e4, kappa_12=3.4e-8, G_1a=24.0, G_2b=250.0, eps=0.25, sigma=0.75)
 OWN = replace(RANDOMIZED, name="own", pullers=Pullers(start_radius_sd=2e-4))

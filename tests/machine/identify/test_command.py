@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from cz_gym.machine.identify import command
-from cz_gym.machine.puller import find_puller, read_puller, write_puller
+from cz_gym.puller.file import find_puller, read_puller, write_puller
+from cz_gym.tools.identify import command
 from examples import identify as example
 from studies import identify as study
 

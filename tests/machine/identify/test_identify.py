@@ -7,23 +7,20 @@ import numpy as np
 import pytest
 
 from cz_gym import CzEnv, Parameters
-from cz_gym.action import HEATER_RANGE, MadeFor
 from cz_gym.baselines.policy import OpenLoop
-from cz_gym.baselines.registry import make_controller
-from cz_gym.body.plant import make_puller
 from cz_gym.episodes.scenario import Reference
-from cz_gym.errors import CzError
-from cz_gym.machine.identify import Excited, identify, read_log, record_log
-from cz_gym.machine.identify.command import main
-from cz_gym.machine.identify.estimate import HEATER, LAGS, PULL
-from cz_gym.machine.identify.excitation import CHIPS, SEQUENCE
-from cz_gym.machine.identify.grid import Log, prepare, shift_drives
-from cz_gym.machine.identify.model import LAM, Lags, Model, Noise, heating, predict, sensitivities
-from cz_gym.machine.identify.moves import measure_excitation
-from cz_gym.machine.identify.verdict import coloured, misfits
-from cz_gym.machine.puller import DEFAULT, find_puller
-from cz_gym.observation import MEASURED, decode
+from cz_gym.physics.plant import make_puller
+from cz_gym.puller.file import DEFAULT, find_puller
+from cz_gym.spaces import HEATER_RANGE, MEASURED, MadeFor, decode
+from cz_gym.support.errors import CzError
 from cz_gym.support.units import MM
+from cz_gym.tools.identify import Excited, identify, read_log, record_log
+from cz_gym.tools.identify.command import main
+from cz_gym.tools.identify.estimate import HEATER, LAGS, PULL, coloured, misfits
+from cz_gym.tools.identify.log import Log, prepare, shift_drives
+from cz_gym.tools.identify.model import LAM, Lags, Model, Noise, heating, predict, sensitivities
+from cz_gym.tools.identify.moves import CHIPS, SEQUENCE, measure_excitation
+from cz_gym.tools.registry import make_controller
 from studies.identify import draw, write_logs
 from tests.foreign_puller import SLOW, ForeignPuller, Operator, drive, write_log
 from tests.machine.identify.conftest import OWN, TRUTH

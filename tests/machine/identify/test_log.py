@@ -7,9 +7,9 @@ import numpy as np
 import pandas
 import pytest
 
-from cz_gym.errors import CzError
-from cz_gym.machine.identify.log import check_puller, column_map, read_log
-from cz_gym.machine.puller import DEFAULT
+from cz_gym.puller.file import DEFAULT
+from cz_gym.support.errors import CzError
+from cz_gym.tools.identify.log import check_puller, column_map, read_log
 from tests.foreign_puller import ForeignPuller, Operator, drive, write_log
 
 

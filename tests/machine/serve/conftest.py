@@ -13,9 +13,9 @@ pytest.importorskip("asyncua", reason="asyncua is absent: pip install '.[plant]'
 from asyncua import Client, ua
 from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 
-from cz_gym.machine.serve.command import commands, door_of, serving
-from cz_gym.machine.serve.machine import TAGS
-from cz_gym.machine.serve.opcua import KINDS, URI
+from cz_gym.tools.serve.command import commands, door_of, serving
+from cz_gym.tools.serve.machine import TAGS
+from cz_gym.tools.serve.opcua import KINDS, URI
 
 PASSWORD = "correct horse"
 

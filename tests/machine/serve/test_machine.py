@@ -9,12 +9,10 @@ import pytest
 
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.errors import CzError
-from cz_gym.machine.export.ports import SETPOINTS
-from cz_gym.machine.puller import PullerFile
-from cz_gym.machine.serve.crystal import CrystalMachine
-from cz_gym.machine.serve.files import LogFile, StateFile
-from cz_gym.machine.serve.machine import Clock, Machine, PullerAlarm
+from cz_gym.puller.file import PullerFile
+from cz_gym.support.errors import CzError
+from cz_gym.tools.export.block import SETPOINTS
+from cz_gym.tools.serve.machine import Clock, CrystalMachine, LogFile, Machine, PullerAlarm, StateFile
 
 PULL, HEATER = SETPOINTS
 

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cz_gym.machine.export.ports import SETPOINTS
-from cz_gym.machine.identify.log import read_log
-from cz_gym.machine.serve import command
+from cz_gym.tools.export.block import SETPOINTS
+from cz_gym.tools.identify.log import read_log
+from cz_gym.tools.serve import command
 from tests.machine.serve.conftest import PASSWORD, answer, connected, free_port, running, with_client
 from tests.processes import ROOT
 

@@ -1,1 +1,0 @@
-"""An agent as a file: its contract, what its graph may hold, and how it is written."""

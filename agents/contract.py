@@ -1,0 +1,202 @@
+"""The contract of an agent file, the JSON beside each ONNX file; and reading and writing both."""
+
+import hashlib
+import json
+import math
+import os
+import stat
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from cz_gym.config import Config
+from cz_gym.crystal.process import ENVIRONMENTS
+from cz_gym.puller.file import DEFAULT
+from cz_gym.spaces import CLIP, observations
+from cz_gym.support.errors import CzError
+from cz_gym.support.files import write_files
+
+FORMAT = "cz-gym-agent"
+FORMAT_VERSION = 6
+MAX_BYTES = 4_000_000
+"""Largest agent file that is read."""
+MAX_JSON_BYTES = 1_000_000
+"""Largest JSON file that is read."""
+MAX_TEXT = 160
+"""Longest text in a contract."""
+MAX_WHOLE = 2**63 - 1
+"""Largest whole number in a contract."""
+
+
+class AgentFileError(CzError):
+    """An agent file is missing, broken, or made for something else; the message is one line."""
+
+
+@dataclass(frozen=True)
+class Contract:
+    """An agent's observation, the meaning of its actions, and its training."""
+
+    observation: str
+    """Name of the observation that it reads."""
+    channels: int
+    """Length of that observation."""
+    observation_hash: str
+    """Hash of that observation's channels: their names, units and scales, in order."""
+    action: str
+    """Meaning of its actions: "direct", "smooth" or "rate" (:func:`cz_gym.spaces.drives_of`)."""
+    control_interval: float
+    """Time between its actions [s]."""
+    plant_hash: str
+    """Hash of the nominal plant it was trained on."""
+    reward_hash: str
+    """Hash of the reward that it was trained and validated with (:attr:`cz_gym.config.Config.reward_hash`)."""
+    scenario: str
+    """Scenario, or shares of scenarios, that it was trained on."""
+    scenario_hash: str
+    """Hash of that scenario."""
+    algorithm: str
+    """Name of the recipe that trained it."""
+    learned_from: str
+    """What it was told in training, in words of :mod:`cz_gym.evaluation.protocol`: REWARD, STATE or PLANT."""
+    training_seed: int
+    """Seed of the training run."""
+    training_steps: int
+    """Environment steps of learning, those after the agent was chosen too."""
+    validation_cost: float
+    """Mean cost of a step [-] on the validation episodes that choose no agent."""
+    validation_rmse_mm: float
+    """Mean RMSE on the same episodes [mm]."""
+    sha256: str
+    """Hash of the ONNX file."""
+    puller: str = DEFAULT.label
+    """Name and hash of the puller file that it was trained for (:attr:`cz_gym.puller.file.PullerFile.label`)."""
+    environment: str = "Cz-v0"
+    """Name of the environment that it was trained in."""
+
+
+LATER = {"puller": DEFAULT.label, "environment": "Cz-v0"}
+"""Fields that older files do not have, and what is true of those."""
+
+
+def observation_hash(name: str, environment: str = "Cz-v0") -> str:
+    """Hash of an observation's channels (16 hex digits): names, units and scales, not their explanations."""
+    listed = observations(ENVIRONMENTS[environment])[name]
+    channels = [(channel.name, channel.unit, channel.scale) for channel in listed]
+    return hashlib.sha256(json.dumps([channels, CLIP]).encode()).hexdigest()[:16]
+
+
+def facts_of(config: Config) -> dict[str, Any]:
+    """The fields of a contract that follow from the environment's settings."""
+    return {
+        "observation": config.observation,
+        "channels": len(observations(config.process)[config.observation]),
+        "action": config.action,
+        "control_interval": config.control_interval,
+        "plant_hash": config.plant_hash,
+        "reward_hash": config.reward_hash,
+        "scenario": config.scenario.name,
+        "scenario_hash": config.scenario.hash,
+        "puller": config.puller.label,
+        "environment": config.process.name,
+    }
+
+
+def make_contract(onnx_bytes: bytes, **facts: Any) -> Contract:
+    """The contract of an ONNX file; ``facts`` are its fields without the hashes of observation and file.
+
+    AgentFileError for a value that no contract may hold.
+    """
+    digest = hashlib.sha256(onnx_bytes).hexdigest()
+    known = {**LATER, **facts, "sha256": digest}
+    known["observation_hash"] = observation_hash(facts["observation"], known["environment"])
+    _check(known, "contract")
+    return Contract(**known)
+
+
+def agent_files(path: Path, onnx_bytes: bytes, contract: Contract) -> dict[Path, bytes]:
+    """The contents of ``path`` (.onnx) and of its contract (.json)."""
+    text = json.dumps({"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(contract)}, indent=2) + "\n"
+    return {path: onnx_bytes, path.with_suffix(".json"): text.encode()}
+
+
+def write_agent(path: Path, onnx_bytes: bytes, **facts: Any) -> Contract:
+    """Write an agent file with its contract; ``facts`` as for :func:`make_contract`."""
+    contract = make_contract(onnx_bytes, **facts)
+    write_files(agent_files(path, onnx_bytes, contract))
+    return contract
+
+
+def read_agent(path: Path) -> tuple[Contract, bytes]:
+    """The contract and the ONNX bytes of an agent file; AgentFileError says what is wrong."""
+    onnx_bytes = read_bounded(path, MAX_BYTES)
+    contract = _parse(path.with_suffix(".json"))
+    if hashlib.sha256(onnx_bytes).hexdigest() != contract.sha256:
+        raise AgentFileError(f"{path}: not the file its contract was written for (SHA-256 differs)")
+    return contract, onnx_bytes
+
+
+def read_bounded(path: Path, limit: int) -> bytes:
+    """The contents of a regular file of at most ``limit`` bytes; AgentFileError for others, also pipes and devices."""
+    try:
+        # O_NONBLOCK: opening a pipe would wait for a writer. O_BINARY: Windows would end the file at a Ctrl-Z.
+        flags = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+        with open(os.open(path, os.O_RDONLY | flags), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise AgentFileError(f"{path}: not a regular file")
+            content = file.read(limit + 1)
+    except FileNotFoundError:
+        raise AgentFileError(f"{path}: no such file") from None
+    except OSError as error:
+        raise AgentFileError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        # AgentFileError is a ValueError; the other one is of a name that no file can have.
+        raise error if isinstance(error, AgentFileError) else AgentFileError(f"{path!r}: {error}") from None
+    if len(content) > limit:
+        raise AgentFileError(f"{path}: larger than {limit} bytes")
+    return content
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file of bounded size; AgentFileError if it is none."""
+    content = read_bounded(path, MAX_JSON_BYTES)
+    try:
+        return json.loads(content)
+    except (ValueError, RecursionError):
+        raise AgentFileError(f"{path}: not JSON") from None
+
+
+def _parse(path: Path) -> Contract:
+    data = read_json(path)
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise AgentFileError(f"{path}: not a {FORMAT} contract")
+    if data.get("format_version") != FORMAT_VERSION:
+        version = data.get("format_version")
+        raise AgentFileError(f"{path}: format version {version!r:.80}, this release reads {FORMAT_VERSION}")
+    wanted = {field.name for field in fields(Contract)}
+    given = {**LATER, **data}
+    del given["format"], given["format_version"]
+    if set(given) != wanted:
+        odd = sorted(set(given) ^ wanted)[0]
+        raise AgentFileError(f"{path}: field {odd!r:.80} is {'missing' if odd in wanted else 'unknown'}")
+    _check(given, path)
+    return Contract(**given)
+
+
+def _check(given: Mapping[str, Any], where: Path | str) -> None:
+    """AgentFileError unless every value is one that the contract's field may hold."""
+    for field in fields(Contract):
+        if wrong := _wrong(field.type, given[field.name]):
+            raise AgentFileError(f"{where}: field {field.name!r} must be {wrong}, not {given[field.name]!r:.80}")
+
+
+def _wrong(kind: Any, value: Any) -> str | None:
+    """What is wrong with a value of this type: the text after "must be"; None if nothing is."""
+    if kind is str:
+        plain = isinstance(value, str) and 0 < len(value) <= MAX_TEXT and value.isprintable() and "|" not in value
+        return None if plain else f"printable text of 1 to {MAX_TEXT} characters without |"  # it stands in tables
+    if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
+        return str(kind.__name__)
+    if isinstance(value, int):
+        return None if 0 <= value <= MAX_WHOLE else f"between 0 and {MAX_WHOLE}"
+    return None if 0.0 <= value < math.inf else "finite and at least 0"

@@ -1,0 +1,268 @@
+"""Recipes: every hyperparameter of every learner. A kind of learner is a dataclass, a recipe one value of it.
+
+A new recipe needs a line in :data:`RECIPES`; a new kind needs a dataclass here and a case in
+:func:`.algorithms.make_algorithm`.
+"""
+
+import inspect
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any, Self
+
+import stable_baselines3
+import torch
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from cz_gym import CzVectorEnv
+from cz_gym.config import Config, make_config
+from cz_gym.crystal.process import ENVIRONMENTS
+from cz_gym.evaluation.protocol import TRAINING_SEEDS
+from cz_gym.evaluation.user_code import scenarios
+from cz_gym.sb3 import ActionRepeat, CzVecEnv
+
+from . import apg
+from .asymmetric import AsymmetricPolicy, AsymmetricSACPolicy
+
+LEAST_ENVS, LEAST_BATCH = 8, 64
+"""Least number of crystals at a time, and of samples in a batch, on a small budget."""
+CZ, CRYSTAL = ENVIRONMENTS
+FEW_UPDATES = 50
+"""Number of updates below which nothing is learned."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """Hyperparameters of every learner; fields have the names of stable-baselines3's arguments."""
+
+    name: str
+    """Name of the agents that it trains."""
+    steps: int
+    """Environment steps that it learns for, with those of repeated actions."""
+    num_envs: int
+    """Crystals at a time."""
+    learning_rate: float
+    """Initial learning rate, decayed linearly."""
+    observation: str = "history"
+    action: str = "smooth"
+    """Meaning of the network's two outputs (:func:`cz_gym.spaces.drives_of`)."""
+    scenario: str = "all"
+    """Scenario or mixture of the training and validation crystals (:func:`cz_gym.evaluation.user_code.scenarios`)."""
+    control_interval: float = 5.0
+    """Time between actions on the default puller [s]."""
+    puller: str = ""
+    """Puller file, or name of a shipped one, which has a control interval of its own; empty: the default puller."""
+    environment: str = ""
+    """Name of the environment; empty: Cz-v0."""
+    stages: tuple[str, ...] = ()
+    """Parts of the crystal that the training and validation crystals grow, in equal shares; none on Cz-v0."""
+
+    fewest_updates: int
+    """Number of updates below which a smaller budget has fewer crystals at a time instead."""
+
+    @property
+    def steps_between(self) -> int:
+        """Environment steps of each crystal between two updates."""
+        raise NotImplementedError
+
+    @property
+    def updates(self) -> int:
+        """Number of updates in the budget."""
+        return self.steps // (self.num_envs * self.steps_between)
+
+    def with_steps(self, steps: int) -> Self:
+        """The recipe on another budget; on a small one with fewer crystals at a time, so that it still learns."""
+        wanted = round(steps / (self.fewest_updates * self.steps_between))
+        return replace(self, steps=steps, num_envs=min(self.num_envs, max(wanted, LEAST_ENVS)))
+
+    @property
+    def config(self) -> Config:
+        """The environment that the recipe's agents act in."""
+        interval, puller = (None, self.puller) if self.puller else (self.control_interval, None)
+        return make_config(
+            scenarios(self.scenario), None, self.observation, interval, action=self.action, puller=puller,
+            process=ENVIRONMENTS[self.environment or CZ], stage=dict.fromkeys(self.stages, 1.0) or None,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class APG(Recipe):
+    """Analytic policy gradients: follows the gradient of the cost through policy, memory and plant."""
+
+    name: str = "gradient"
+    steps: int = 24_192_000
+    num_envs: int = 192
+    learning_rate: float = 4e-3
+    observation: str = "measured"
+    action: str = "rate"
+    window: int = 180
+    """Steps of a crystal that a gradient goes back through."""
+    fewest_updates: int = 400
+    betas: tuple[float, float] = (0.9, 0.9)
+    """Adam's decays. The first gradients, of lost crystals, are a thousand times those that follow: their squares must
+    be forgotten soon."""
+
+    @property
+    def steps_between(self) -> int:
+        """The window."""
+        return self.window
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reinforcement(Recipe):
+    """Learns from reward, by trying; stable-baselines3's ``VecNormalize`` scales the reward. Observations are scaled by
+    the environment: running means would remember the lost crystals of the first minutes, and make a reading that is
+    not valid, one in hundreds, an input of -10. Critics that are told read the plant's true state
+    (:mod:`cz_gym.agents.asymmetric`); actors never do, but their estimate is fitted to it.
+    """
+
+    hidden: tuple[int, ...] = (64, 64)
+    """Widths of the actor's hidden layers."""
+    critic_hidden: tuple[int, ...] = (64, 64)
+    """Widths of the critic's hidden layers."""
+    told: bool = True
+    """Whether the true state is told in training."""
+    action_repeat: int
+    """Environment steps that an action is held for in training: the effect of one of 5 s is lost in the noise."""
+    gamma: float = 0.99
+    """Discount of an action's steps together."""
+    batch_size: int
+    n_steps: int
+    """Actions on each crystal between updates of PPO; actions whose rewards a target of SAC has."""
+
+    @property
+    def steps_between(self) -> int:
+        """PPO's rollout."""
+        return self.action_repeat * self.n_steps
+
+    def with_steps(self, steps: int) -> Self:
+        """As for every recipe; batches become smaller as the number of crystals does."""
+        fewer = super().with_steps(steps)
+        return replace(fewer, batch_size=max(self.batch_size * fewer.num_envs // self.num_envs, LEAST_BATCH))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPO(Reinforcement):
+    """Proximal policy optimisation; the actor reads an estimate of the plant's state
+    (:class:`cz_gym.agents.asymmetric.StateEstimator`)."""
+
+    name: str = "ppo"
+    hidden: tuple[int, ...] = (32, 32)
+    steps: int = 64_000_000
+    num_envs: int = 2048
+    """Many crystals at a time: what an action changes is small beside what the disturbances do."""
+    action_repeat: int = 4
+    n_steps: int = 32
+    fewest_updates: int = 90
+    batch_size: int = 2048
+    n_epochs: int = 5
+    learning_rate: float = 1e-3
+    gae_lambda: float = 0.9
+    """Lower than stable-baselines3's 0.95: a critic that reads the true state is a good judge."""
+    log_std_init: float = -0.7
+    """Logarithm of the initial standard deviation of the actions."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SAC(Reinforcement):
+    """Soft actor-critic; its actor has PPO's estimate, its critics read products of state and action
+    (:class:`cz_gym.agents.asymmetric.StateCritic`)."""
+
+    name: str = "sac"
+    hidden: tuple[int, ...] = (32, 32)
+    critic_hidden: tuple[int, ...] = (128, 128)
+    steps: int = 20_000_000
+    num_envs: int = 512
+    action_repeat: int = 4
+    n_steps: int = 4
+    fewest_updates: int = 4000
+    buffer_size: int = 1_000_000
+    learning_starts: int = 10_000
+    """Actions before the first update."""
+    batch_size: int = 512
+    gradient_steps: int = 4
+    """Updates after each action of all crystals."""
+    learning_rate: float = 5e-4
+    tau: float = 0.01
+    ent_coef: str = "auto_0.005"
+    """Initial weight of the entropy; it adapts."""
+    target_entropy: float = 0.5
+    """Entropy of an action's distribution that the weight adapts to: a standard deviation of 0.3 in each drive."""
+
+    @property
+    def steps_between(self) -> int:
+        """The steps of an action."""
+        return self.action_repeat
+
+
+PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64))
+"""stable-baselines3's own PPO, told nothing: beside ``ppo`` it shows what the true state is worth in training."""
+RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG())}
+"""Recipes by name: the choices of ``train.py --algo``."""
+_along: dict[str, Any] = {
+    "environment": CRYSTAL,
+    "stages": ("crown", "body", "tail"),
+    "scenario": "randomized=0.5,hard=0.5",
+}
+CRYSTAL_RECIPES: dict[str, Recipe] = {
+    "ppo": PPO(name="ppo-along", **_along),
+    "gradient": APG(name="gradient-along", num_envs=96, steps=17_280_000, **_along),
+}
+"""Recipes of CzCrystal-v0: one agent for crown, body and tail."""
+DEFAULT = "ppo"
+"""The recipe that train.py follows unless another is named."""
+
+
+# From a recipe to an algorithm with stable-baselines3's interface, on the native batch.
+
+
+def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
+    """The algorithm of a recipe for a training seed; a resumed one has taken ``done`` steps before."""
+    torch.set_num_threads(1)  # small networks are quicker so
+    torch.manual_seed(seed)
+    learns = isinstance(recipe, Reinforcement)
+    told = isinstance(recipe, Reinforcement) and recipe.told
+    batch = CzVectorEnv.from_config(
+        recipe.config, recipe.num_envs, AutoresetMode.SAME_STEP, info="all" if told else "lean"
+    )
+    env: VecEnv = CzVecEnv(batch, seed + done if learns else None, critic_state=told)
+    kind: Any
+    policy: Any
+    options = dict[str, Any]()
+    match recipe:
+        case APG():
+            kind, policy, options = apg.APG, "RecurrentPolicy", {"betas": recipe.betas}
+        case PPO():
+            kind, policy, critics = stable_baselines3.PPO, AsymmetricPolicy if told else "MlpPolicy", "vf"
+            options = {"log_std_init": recipe.log_std_init}
+        case SAC():
+            kind, policy, critics = stable_baselines3.SAC, AsymmetricSACPolicy, "qf"
+            options = {"activation_fn": torch.nn.Tanh}
+        case _:
+            raise TypeError(f"no algorithm for a {type(recipe).__name__}")
+    known = {name for each in kind.__mro__ for name in inspect.signature(each.__init__).parameters}
+    settings = {name: getattr(recipe, name) for name in asdict(recipe) if name in known}
+    if isinstance(recipe, Reinforcement):
+        env = ActionRepeat(env, recipe.action_repeat)
+        env = VecNormalize(env, norm_obs=False, gamma=recipe.gamma)
+        settings["learning_rate"] = partial(linear, recipe.learning_rate)
+        options["net_arch"] = {"pi": list(recipe.hidden), critics: list(recipe.critic_hidden)}
+    if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer
+        settings["learning_starts"] += done // recipe.action_repeat
+    made: BaseAlgorithm = kind(policy, env, policy_kwargs=options, seed=seed, device="cpu", **settings)
+    # The algorithm's constructor has set the slots' seeds to ``seed`` and those after it: neighbouring training seeds
+    # would meet the same crystals, and a resumed run its first ones again.
+    made.set_random_seed((seed * 10_007 + done) % (len(TRAINING_SEEDS) - recipe.num_envs))
+    made.num_timesteps = done // repeat_of(recipe)
+    return made
+
+
+def repeat_of(recipe: Recipe) -> int:
+    """Environment steps of each of the algorithm's time steps."""
+    return recipe.action_repeat if isinstance(recipe, Reinforcement) else 1
+
+
+def linear(start: float, left: float) -> float:
+    """A learning rate that falls linearly with the share of training that is left, to a twentieth."""
+    return start * (0.05 + 0.95 * left)

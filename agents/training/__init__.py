@@ -1,1 +1,0 @@
-"""Training with stable-baselines3: recipes, networks, learners, runs with checkpoints."""

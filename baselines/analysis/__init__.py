@@ -1,1 +1,0 @@
-"""Loops as control engineers judge them: design, sampled loops, margins, linear forms."""

@@ -1,0 +1,351 @@
+"""PIDs of a whole crystal on the bright ring: with gains that change in the cones, and a compensator that runs along.
+
+The ring moves with the meniscus height as well as with the radius, in the crown ten times as much as in the body. The
+compensator predicts the height's deviation from the recipe from the applied pull speed and takes its share off the
+ring, with both numbers scheduled on the length. Radii [m], speeds [m/s], temperatures [K], power [W].
+"""
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from scipy.linalg import expm, solve_discrete_are
+
+from cz_gym.crystal.process import CRYSTAL, Along, along
+from cz_gym.crystal.signals import Measured, TrueState
+from cz_gym.physics.meniscus import MeniscusModel
+from cz_gym.process import Process, scales, signals
+from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN
+
+from .pid import Heat, PIDState, SeriesPID, TemperatureLoop
+from .policy import Floats, MeasuredController, check_numbers
+
+BLEND = 40.0 * MM
+"""Length of body over which the gain changes after the crown and before the tail [m]."""
+
+
+def in_cones(factor: float, L: Floats, q: Any) -> Floats:
+    """A factor at a length: 1 in the body, ``factor`` in the cones; it changes within :data:`BLEND` of the body, as a
+    jump would kick the pull.
+    """
+    ends = q.crown_length + q.body_length
+    at = q.crown_length, q.crown_length + BLEND, ends - BLEND, ends
+    return np.interp(L, at, (factor, 1.0, 1.0, factor))
+
+
+class CrystalPIDMemory(NamedTuple):
+    """The memory of :class:`CrystalPID`; each of shape (n,)."""
+
+    height: Floats
+    """Predicted deviation of the meniscus height from the recipe's [m]."""
+    filtered: Floats
+    """Filtered radius error [m]."""
+    pid: PIDState
+    command: Floats
+    """Last commanded pull speed above the recipe's [m/s]."""
+    heat: Heat
+    start: Floats
+    """What the pyrometer showed above the recipe at the first sample [K]."""
+
+
+@dataclass(frozen=True)
+class CrystalPID(MeasuredController):
+    """v_p = recipe + K F (gain e), e the ring's error, less c_h(L) dh if it compensates.
+
+    dh' = v_p - recipe - (a_h(L) + slow) dh, F = 1/(1 + T_f s); gain is 1 in the body, ``cone_gain`` in crown and tail.
+    The integrator follows the applied pull speed within ``T_track``. The recipe's temperature is shifted to what the
+    pyrometer shows at the start, as an operator does: the crystal grows there.
+    """
+
+    process: ClassVar[Process] = CRYSTAL
+
+    pid: SeriesPID = field(default_factory=SeriesPID)
+    cone_gain: float = 1.0
+    """Gain of the error in crown and tail [-]."""
+    compensates: bool = True
+    """Whether the predicted height is taken off the ring."""
+    lam: float = 0.5
+    """Share of conduction in its model [-]."""
+    slow: float = 2.0e-4
+    """Rate with which the predicted height is forgotten [rad/s]."""
+    T_f: float = 20.0
+    """Time constant of the measurement filter [s]; 0 for none."""
+    T_track: float = 600.0
+    """Time constant with which the integrator follows a limited drive [s]."""
+    heater: TemperatureLoop = field(default_factory=TemperatureLoop)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_numbers(self, positive=("T_track",), not_negative=("cone_gain", "slow", "T_f"))
+
+    @cached_property
+    def schedule(self) -> Along:
+        """The linearisation along the recipe."""
+        return along(self.parameters, self.meniscus, self.lam)
+
+    def at_rest(self, seen: Any) -> CrystalPIDMemory:
+        """The applied pull speed and power continue."""
+        zero = np.zeros_like(seen.v_p)
+        pid = PIDState(zero, zero, seen.v_p / self.pid.K_p)
+        return CrystalPIDMemory(zero, zero, pid, seen.v_p, self.heater.at_rest(seen), seen.T_1 - seen.T_1_ref)
+
+    def step(self, seen: Any, memory: CrystalPIDMemory) -> tuple[Floats, Floats, CrystalPIDMemory]:
+        """Pull speed and heater power above the recipe's, and the new memory."""
+        dt, at = self.control_interval, self.schedule
+        forgets = np.interp(seen.L, at.L, at.a_h) + self.slow
+        left = np.exp(-forgets * dt)
+        height = left * memory.height + (1.0 - left) / forgets * seen.v_p
+        error = seen.ring_error - (np.interp(seen.L, at.L, at.c_h) * height if self.compensates else 0.0)
+        pace = -math.expm1(-dt / self.T_f) if self.T_f > 0.0 else 1.0
+        filtered = memory.filtered + pace * (error - memory.filtered)
+        missed = (seen.v_p - memory.command) / self.pid.K_p
+        tracking = memory.pid.integral + min(dt / self.T_track, 1.0) * missed
+        gain = in_cones(self.cone_gain, seen.L, self.parameters)
+        pull, pid = self.pid.step(gain * filtered, memory.pid._replace(integral=tracking), dt)
+        shifted = seen._replace(T_1_ref=seen.T_1_ref + memory.start)
+        power, heat = self.heater.step(shifted, memory.heat, dt, self.v_0, self.heater_range)
+        return pull, power, CrystalPIDMemory(height, filtered, pid, pull, heat, memory.start)
+
+
+@dataclass(frozen=True)
+class TrueRadiusPID(CrystalPID):
+    """The same on the true radius, which no sensor shows: a bound."""
+
+    observation: ClassVar[str] = "state"
+
+    compensates: bool = False
+
+    def read(self, array: Floats) -> Any:
+        """The true state in the measured channels."""
+        channels = tuple(signals(TrueState).values())
+        true = TrueState(*np.moveaxis(array * scales(channels, self.v_0, self.heater_range), -1, 0))
+        known = {name: getattr(true, name) for name in Measured._fields if name in TrueState._fields}
+        nothing = np.zeros_like(true.L)
+        return Measured(**dict.fromkeys(Measured._fields, nothing) | known)._replace(
+            ring_error=true.r_c_error, valid=nothing + 1.0
+        )
+
+
+# A linear quadratic Gaussian regulator of a whole crystal: Kalman filter and regulator at each length of the recipe.
+#
+# Both are solved for the linearisation at some lengths, as if the crystal stayed there, and interpolated between, once
+# for each of several shares of conduction. The filter reads ring, pyrometer and load cell: a radius that is too small
+# and a meniscus that is too high look alike to the camera in the crown, but weigh differently. The model has three
+# states that are not the plant's: the interface's slow fluctuation, the drift of the hot zone, which the recipe that
+# is given follows, and the error of that recipe. SI units.
+
+REGULATED, STATES, DRIVES = 8, 9, 2
+"""r_c, h_c, T_1, T_2, T_b, then the fluctuation, the drift and the recipe's error [K], then the crystal's mass [kg],
+which is estimated and not regulated."""
+_T_1, _FLUCTUATION, _DRIFT, _MASS = 2, 5, 6, 8
+_PLANT, _EXOGENOUS = [0, 1, 2, 3, 4, _MASS], slice(_FLUCTUATION, _MASS)
+"""The states that are the plant's, in the order of its linearisation, and those that are not."""
+_SIZES = np.array([MM, MM, *[1.0] * 6, 0.1, MM_PER_MIN, KILO])
+"""Sizes of the states and the drives, in SI units."""
+_SEEN = np.array([MM, 1.0, 1.0])
+"""Sizes of what is seen: ring [m], pyrometer [K], load cell [N]."""
+
+
+class Noise(NamedTuple):
+    """What the filter expects."""
+
+    ring: float = 0.06 * MM
+    """Noise of the ring [m]."""
+    pyrometer: float = 0.1
+    """Noise of the pyrometer [K]."""
+    weight: float = 0.4
+    """Noise of the load cell [N]."""
+    height: float = 2.0e-7
+    """Walk of the height in the body, for what the model lacks [m/sqrt(s)]."""
+    cones: float = 1.0
+    """The same in crown and tail, in multiples of the body's [-]."""
+    temperature: float = 3.0e-3
+    """Walk of each temperature [K/sqrt(s)]."""
+    mass: float = 1.0e-4
+    """Walk of the crystal's mass, for what the model lacks [kg/sqrt(s)]."""
+    fluctuation: float = 0.4
+    """Standard deviation of the interface's fluctuation [K]."""
+    tau: float = 400.0
+    """Correlation time of the interface's fluctuation [s]."""
+    drift: float = 3.0
+    """Standard deviation of the drift of the hot zone [K]."""
+    recipe: float = 4.0
+    """Standard deviation of the recipe's error [K]."""
+    slow: float = 2.0 * HOUR
+    """Correlation time of drift and recipe's error [s]."""
+
+
+class Weights(NamedTuple):
+    """What the regulator weighs: deviations that cost 1."""
+
+    radius: float = 0.5 * MM
+    height: float = 0.4 * MM
+    cones: float = 1.0
+    """The height's deviation in crown and tail, in multiples of the body's [-]."""
+    pull: float = 0.3 * MM_PER_MIN
+    pull_step: float = 0.06 * MM_PER_MIN
+    power: float = 4.0 * KILO
+    power_step: float = 1.0 * KILO
+
+
+class Gains(NamedTuple):
+    """Model, filter and regulator at lengths L [m]: each of shape (lengths, rows, columns)."""
+
+    L: Floats
+    A: Floats
+    B: Floats
+    C: Floats
+    K: Floats
+    """From innovations to states."""
+    F: Floats
+    """From states and last drives to drives."""
+    S: Floats
+    """Inverse of the innovations' covariance."""
+
+
+@lru_cache(maxsize=12)
+def design(parameters: Any, meniscus: MeniscusModel, dt: float, lam: float, noise: Noise, weights: Weights) -> Gains:
+    """Design filter and regulator for a control interval [s]."""
+    at = along(parameters, meniscus, lam)
+    walks = noise.height * in_cones(noise.cones, at.L, parameters)
+    heights = weights.height * in_cones(weights.cones, at.L, parameters)
+    designs = [
+        _at(A, B, C, at.load, dt, noise._replace(height=float(walk)), weights._replace(height=float(height)))
+        for A, B, C, walk, height in zip(at.A, at.B, at.C, walks, heights, strict=True)
+    ]
+    return Gains(at.L, *(np.stack(each) for each in zip(*designs, strict=True)))
+
+
+def _at(A: Floats, B: Floats, C: Floats, load: float, dt: float, noise: Noise, weights: Weights) -> tuple[Floats, ...]:
+    """A, B and C in discrete time, K and F at one length."""
+    rates = 1.0 / np.array([noise.tau, noise.slow, noise.slow])
+    whole = np.zeros((STATES + DRIVES, STATES + DRIVES))
+    whole[np.ix_(_PLANT, _PLANT)], whole[_PLANT, STATES:] = A, B[:, :DRIVES]
+    whole[_PLANT, _FLUCTUATION], whole[_PLANT, _DRIFT] = B[:, 3], load * B[:, 2]
+    whole[_EXOGENOUS, _EXOGENOUS] = -np.diag(rates)
+    moved = expm(whole * dt)
+    F_d, B_d = moved[:STATES, :STATES], moved[:STATES, STATES:]
+    seen = np.zeros((len(_SEEN), STATES))
+    seen[np.ix_([0, 2], _PLANT)], seen[1, _T_1], seen[1, _DRIFT:_MASS] = C, 1.0, -1.0
+    walks = np.array([1e-9, noise.height, *[noise.temperature] * 3, 0.0, 0.0, 0.0, noise.mass])
+    sizes = np.array([noise.fluctuation, noise.drift, noise.recipe])
+    Q = np.diag(walks**2 * dt)
+    Q[_EXOGENOUS, _EXOGENOUS] = np.diag(sizes**2 * (1.0 - np.exp(-2.0 * rates * dt)))
+    R = np.diag([noise.ring**2, noise.pyrometer**2, noise.weight**2])
+    P = _solve(F_d.T, seen.T, Q, R, 1.0 / _SIZES[:STATES], 1.0 / _SEEN)
+    S: Floats = np.asarray(np.linalg.inv(seen @ P @ seen.T + R), np.float64)
+    F = np.zeros((DRIVES, STATES + DRIVES))
+    acts = [*range(REGULATED), *range(STATES, STATES + DRIVES)]
+    F[:, acts] = _regulator(F_d[:REGULATED, :REGULATED], B_d[:REGULATED], weights)
+    return F_d, B_d, seen, P @ seen.T @ S, F, S
+
+
+def _regulator(A: Floats, B: Floats, weights: Weights) -> Floats:
+    """From states, without the mass, and last drives to drives: least mean cost of radius, drives and their steps."""
+    n = REGULATED + DRIVES
+    move, act, cost, cross = np.zeros((n, n)), np.zeros((n, DRIVES)), np.zeros((n, n)), np.zeros((n, DRIVES))
+    move[:REGULATED, :REGULATED], act[:REGULATED], act[REGULATED:] = A, B, np.eye(DRIVES)
+    cost[0, 0], cost[1, 1] = weights.radius**-2.0, weights.height**-2.0
+    steps = np.diag([weights.pull_step**-2.0, weights.power_step**-2.0])
+    cost[REGULATED:, REGULATED:], cross[REGULATED:] = steps, -steps
+    drives = steps + np.diag([weights.pull**-2.0, weights.power**-2.0])
+    sizes = np.delete(_SIZES, _MASS)
+    S = _solve(move, act, cost, drives, sizes, sizes[REGULATED:], cross)
+    gain = np.linalg.solve(drives + act.T @ S @ act, act.T @ S @ move + cross.T)
+    return np.asarray(-gain, np.float64)
+
+
+def _solve(A: Floats, B: Floats, Q: Floats, R: Floats, x: Floats, u: Floats, S: Floats | None = None) -> Floats:
+    """Solve the Riccati equation in numbers of order one: x and u are the sizes of states and inputs."""
+    scaled = solve_discrete_are(
+        A * np.outer(1.0 / x, x), B * np.outer(1.0 / x, u), Q * np.outer(x, x), R * np.outer(u, u),
+        s=None if S is None else S * np.outer(x, u),
+    )  # fmt: skip
+    solved: Floats = scaled * np.outer(1.0 / x, 1.0 / x)
+    return solved
+
+
+class CrystalLQGMemory(NamedTuple):
+    """The memory of :class:`CrystalLQG`."""
+
+    x: Floats
+    """Estimated states by each model, shape (n, models, 9)."""
+    evidence: Floats
+    """Logarithm of how well each model has predicted, the best one's zero, shape (n, models)."""
+
+
+@dataclass(frozen=True)
+class CrystalLQG(MeasuredController):
+    """Filters and regulators for several shares of conduction, the drives weighted by how well each filter predicts.
+
+    What the camera does not see is not corrected while it is blind.
+    """
+
+    process: ClassVar[Process] = CRYSTAL
+
+    models: tuple[float, ...] = (0.0, 0.1, 0.35, 0.9)
+    """Shares of conduction that it considers possible [-]."""
+    forgets: float = 2.0 * HOUR
+    """Time after which a model's mistakes are forgotten [s]."""
+    noise: Noise = field(default_factory=Noise)
+    weights: Weights = field(default_factory=Weights)
+    jump: float = 1.0 * MM
+    """Largest innovation of the ring that counts [m]."""
+
+    def at_rest(self, seen: Any) -> CrystalLQGMemory:
+        """On the recipe, as far as the first sample tells; no model is better than the others."""
+        x = np.zeros((len(seen.L), len(self.models), STATES))
+        x[:, :, REGULATED - 1] = (seen.T_1_ref - seen.T_1)[:, None]
+        return CrystalLQGMemory(x, np.zeros(x.shape[:2]))
+
+    def step(self, seen: Any, memory: CrystalLQGMemory) -> tuple[Floats, Floats, CrystalLQGMemory]:
+        """Pull speed and heater power above the recipe's, and the new memory."""
+        u = np.stack([seen.v_p, seen.Q_H], axis=1)
+        told = np.stack([seen.ring_error, seen.T_1 - seen.T_1_ref, seen.weight], axis=1)
+        blind = seen.valid < 0.5
+        states, drives = np.empty_like(memory.x), np.empty((*memory.x.shape[:2], DRIVES))
+        evidence = memory.evidence * math.exp(-self.control_interval / self.forgets)
+        for number, lam in enumerate(self.models):
+            at = design(self.parameters, self.meniscus, self.control_interval, lam, self.noise, self.weights)
+            near, share = _between(at.L, seen.L)
+            A, B, C, K, F, S = (_mix(each, near, share) for each in at[1:])
+            K[blind], S[blind] = without_ring(K[blind], S[blind])
+            x = _times(A, memory.x[:, number]) + _times(B, u)
+            new = told - _times(C, x)
+            new[:, 0] = np.where(blind, 0.0, np.clip(new[:, 0], -self.jump, self.jump))
+            evidence[:, number] += 0.5 * (np.log(np.linalg.det(S)) - np.sum(new * _times(S, new), axis=1))
+            states[:, number] = x + _times(K, new)
+            drives[:, number] = _times(F, np.concatenate([states[:, number], u], axis=1))
+        evidence -= evidence.max(axis=1, keepdims=True)
+        weights = np.exp(evidence)[:, :, None]
+        acts = (weights * drives).sum(axis=1) / weights.sum(axis=1)
+        return acts[:, 0], acts[:, 1], CrystalLQGMemory(states, evidence)
+
+
+def without_ring(K: Floats, S: Floats) -> tuple[Floats, Floats]:
+    """Gains and inverse covariance where the ring is not seen: those of pyrometer and load cell alone."""
+    covariance, gain, known = np.linalg.inv(S), np.zeros_like(K), np.zeros_like(S)
+    known[:, 0, 0] = 1.0  # of an innovation that is zero
+    known[:, 1:, 1:] = np.linalg.inv(covariance[:, 1:, 1:])
+    gain[:, :, 1:] = (K @ covariance)[:, :, 1:] @ known[:, 1:, 1:]
+    return gain, known
+
+
+def _between(L: Floats, at: Floats) -> tuple[Any, Floats]:
+    """The design before each length, and the share of the way to the next."""
+    place = np.clip((at - L[0]) / (L[1] - L[0]), 0.0, len(L) - 1.0 - 1e-9)
+    near = place.astype(np.int64)
+    return near, (place - near)[:, None, None]
+
+
+def _mix(gains: Floats, near: Any, share: Floats) -> Floats:
+    mixed: Floats = gains[near] + share * (gains[near + 1] - gains[near])
+    return mixed
+
+
+def _times(matrices: Floats, vectors: Floats) -> Floats:
+    """A matrix a crystal times a vector a crystal."""
+    product: Floats = np.einsum("nij,nj->ni", matrices, vectors)
+    return product

@@ -1,0 +1,257 @@
+"""Linear-quadratic regulator with costs on input moves, known disturbances and a previewed reference.
+
+The disturbance states, which drive the plant and are not moved by it, enter by a Sylvester equation: in the Riccati
+equation an integrating disturbance would be unstabilisable.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import solve_discrete_are
+
+from cz_gym.body.signals import PREVIEWS, WEIGHTS, Measured, Weights, coefficients
+from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.physics.plant import Puller, make_puller
+from cz_gym.support.names import stack
+from cz_gym.support.units import KILO, MM_PER_MIN
+
+from .lqg_estimator import Hypotheses, MultipleModelFilter, PlantFilter, multiple_model_filter
+from .lqg_filter import DRIFT, PLANT, STATES, NoiseModel, PlantModel, RingModel, augmented, plant_model
+from .policy import Floats, MeasuredController
+
+PULL_SCALE = 0.36 * MM_PER_MIN
+"""Deviation of the pull speed at which its quadratic term equals its weight [m/s]; the reward charges its mean, beyond
+a band."""
+STEP_TIME = 5.0
+"""Control interval [s] of the weights on moves; at other intervals the continuous-time law stays the same."""
+
+
+class Regulator(NamedTuple):
+    """Moves du = -feedback (x_hat - (r_ref, 0, ...), v, q) + sum_j reference_j dr_ref_j + drift_j dp_j.
+
+    dr_ref_j [m] and dp_j [K] are the known increments from t + j dt to t + (j + 1) dt. The least cost from
+    z = (plant's five states, previous inputs) and disturbance states d on is z' P z + 2 z' X d, up to terms in d alone.
+    ``feedback`` has shape (2, 12): the augmented plant's ten states, then the previous inputs; ``reference`` and
+    ``drift`` have shape (samples ahead, 2), P (7, 7), X (7, 5).
+    """
+
+    feedback: Floats
+    reference: Floats
+    drift: Floats
+    P: Floats
+    X: Floats
+
+
+def quadratic_cost(weights: Weights, dt: float) -> tuple[Floats, Floats, Floats]:
+    """Q, N and R of the cost sum z' Q z + 2 z' N du + du' R du, z = (plant's states, previous inputs), for dt [s]."""
+    Q, N = np.zeros((PLANT + 2, PLANT + 2)), np.zeros((PLANT + 2, 2))
+    per_square, pull = coefficients(weights), weights.pull / PULL_SCALE**2
+    per_step = (STEP_TIME / dt) ** 2
+    Q[0, 0] = per_square.radius
+    Q[PLANT, PLANT] = N[PLANT, 0] = pull
+    R = np.diag([pull + per_step * per_square.pull_step, per_step * per_square.heater_step])
+    return Q, N, R
+
+
+def regulator(model: PlantModel, weights: Weights, dt: float) -> Regulator:
+    """The optimal moves for that plant and cost, with the preview of the observations.
+
+    With P the Riccati solution, S = R + B' P B and A_c the closed loop, a known later change f_j of the state calls for
+    -S^-1 B' (A_c')^j P f_j now; disturbances x_d' = A_d x_d entering by E add X = A_c' (P E + X A_d).
+    """
+    known = len(STATES)
+    A = np.block([[model.A[:PLANT, :PLANT], model.B[:PLANT]], [np.zeros((2, PLANT)), np.eye(2)]])
+    B = np.vstack([model.B[:PLANT], np.eye(2)])
+    E = np.vstack([model.A[:PLANT, PLANT:known], np.zeros((2, known - PLANT))])
+    A_d = model.A[PLANT:known, PLANT:known]
+    Q, N, R = quadratic_cost(weights, dt)
+    P = solve_discrete_are(A, B, Q, R, s=N)
+    S = R + B.T @ P @ B
+    K = np.linalg.solve(S, B.T @ P @ A + N.T)
+    A_c = A - B @ K
+    cross = np.eye(E.size) - np.kron(A_c.T, A_d.T)
+    X = np.linalg.solve(cross, (A_c.T @ P @ E).ravel()).reshape(E.shape)
+    K_d = np.linalg.solve(S, B.T @ (P @ E + X @ A_d))
+    moves = np.linalg.solve(S, B.T)
+    reference, drift = [], []
+    later_reference, later_drift = P[:, 0], X[:, DRIFT - PLANT]
+    for _ in range(samples_ahead(dt)):
+        reference.append(moves @ later_reference)
+        drift.append(-moves @ later_drift)
+        later_reference, later_drift = A_c.T @ later_reference, A_c.T @ later_drift
+    feedback = np.hstack([K[:, :PLANT], K_d, K[:, PLANT:]])
+    return Regulator(feedback, np.array(reference), np.array(drift), P, X)
+
+
+def samples_ahead(dt: float) -> int:
+    """Number of samples in the preview; the nearest whole number if dt [s] does not divide it."""
+    return max(1, round(PREVIEWS[-1] / dt))
+
+
+def look_ahead(plan: Floats, seen: Measured, starts: npt.NDArray[np.bool_], dt: float) -> Floats:
+    """The recipe ahead after one more sample.
+
+    ``plan`` holds r_ref [m] and T_1_ref [K] (deviations) from now to the end of the preview, shape
+    (n, 2, samples ahead + 1). In slots that start it is interpolated from the three previewed samples.
+    """
+    radius = seen.r_ref, seen.r_ref_1min, seen.r_ref_5min
+    temperature = seen.T_1_ref, seen.T_1_ref_1min, seen.T_1_ref_5min
+    previewed = np.stack([np.stack(radius), np.stack(temperature)]).transpose(2, 0, 1)
+    moved = np.concatenate([plan[:, :, 1:], previewed[:, :, -1:]], axis=2)
+    moved[:, :, 0] = previewed[:, :, 0]
+    if starts.any():
+        t = np.minimum(np.arange(plan.shape[2]) * dt, PREVIEWS[-1])
+        shares = np.array([np.interp(t, PREVIEWS, one) for one in np.eye(len(PREVIEWS))])
+        moved[starts] = (previewed[..., None] * shares).sum(axis=2)[starts]
+    return moved
+
+
+# Linear-quadratic-Gaussian control of pull speed and heater together: filter, regulator and their design.
+
+
+@dataclass(frozen=True)
+class LQGDesign:
+    """Everything that is chosen about an LQG."""
+
+    noise: NoiseModel = field(default_factory=NoiseModel)
+    weights: Weights = WEIGHTS
+    """Weights of the regulator's quadratic cost, whose term of the pull speed has no band."""
+    lam: float = 0.5
+    """Share of conduction at the design point [-]."""
+    nonlinear: bool = True
+    """Whether the filters predict with the plant's equations, or with the linearised ones."""
+    gate: float = 4.0
+    """Limit of the innovations, in standard deviations [-]."""
+    heater_slack: float = 0.06 * KILO
+    """Difference between commanded and applied power [W] that is due to the resolution of the drive."""
+    ring: RingModel | None = None
+    """Model of a camera with latency or a ring with ripple; None for neither."""
+    error_pull: float | None = None
+    """Largest move of the pull speed that the radius error alone asks for [m/s]; None: any. What is left of the drive's
+    window damps the meniscus height, without which narrow and slow drives swing between their limits until the crystal
+    is lost (nested saturation, Teel 1992)."""
+
+
+PUZZLING = 1.0
+"""Mean of the ring's innovations over ten minutes, in standard deviations, that no good model has; of the pyrometer's,
+which may also stick or drift, twice as much [-]."""
+
+
+class Gains(NamedTuple):
+    """Filter and regulator of one puller, or of one puller a slot."""
+
+    filter: PlantFilter
+    regulator: Regulator
+    """Its arrays have a leading axis n for one puller a slot."""
+
+
+class Memory(NamedTuple):
+    """The memory of an LQG."""
+
+    filter: Any
+    """State of the filter or of the filter bank."""
+    plan: Floats
+    """Recipe ahead, shape (n, 2, samples + 1): r_ref [m] and T_1_ref [K]."""
+    command: Floats
+    """Last commanded inputs [m/s, W], deviations, shape (n, 2)."""
+    started: Floats
+    """1 once the slot has seen a sample, shape (n,)."""
+
+
+@lru_cache(maxsize=16)
+def solve(design: LQGDesign, dt: float, puller: Puller, meniscus: MeniscusModel = HURLE) -> Gains:
+    """Linearise at the puller's operating point and solve the regulator's Riccati equation."""
+    model = plant_model(puller, design.noise, dt, meniscus)
+    if design.ring is not None:
+        model = augmented(model, design.ring, dt)
+    chosen = design.nonlinear, design.gate, design.ring
+    state_filter = PlantFilter(puller, model, design.noise, meniscus, dt, *chosen)
+    return Gains(state_filter, regulator(model, design.weights, dt))
+
+
+def solve_each(
+    designs: Sequence[LQGDesign], dt: float, pullers: Sequence[Puller], meniscus: MeniscusModel = HURLE
+) -> Gains:
+    """The gains of one design and one puller a slot; the designs may differ in the noise that drives the plant."""
+    pairs = zip(designs, pullers, strict=True)
+    filters, laws = zip(*(solve.__wrapped__(each, dt, puller, meniscus) for each, puller in pairs), strict=True)
+    plant = stack([each.plant for each in filters])
+    return Gains(filters[0]._replace(puller=stack(pullers), plant=plant), stack(laws))
+
+
+@dataclass(frozen=True)
+class LQG(MeasuredController):
+    """The LQG of the nominal puller; with ``hypotheses``, one that estimates the strength of the fluctuations."""
+
+    accepts_missing_temperature: ClassVar[bool] = True
+
+    design: LQGDesign = LQGDesign()
+    hypotheses: Hypotheses | None = None
+    """Fluctuations that a bank of filters considers possible; None for a single filter."""
+
+    @property
+    def exportable(self) -> bool:
+        """Whether it has a single filter."""
+        return self.hypotheses is None
+
+    @cached_property
+    def gains(self) -> Gains:
+        """Gains of the design point."""
+        puller = make_puller(self.parameters, self.design.lam, self.meniscus)
+        return solve(self.design, self.control_interval, puller, self.meniscus)
+
+    def estimator(self, n: int) -> PlantFilter | MultipleModelFilter:
+        """The filter, or the bank of filters, for n slots."""
+        return self.gains.filter if self.hypotheses is None else _bank(self, self.hypotheses, n)
+
+    def at_rest(self, seen: Measured) -> Memory:
+        """The filter at its initial covariance."""
+        n = len(seen.v_p)
+        plan = np.zeros((n, 2, samples_ahead(self.control_interval) + 1))
+        return Memory(self.estimator(n).at_rest(n), plan, np.zeros((n, 2)), np.zeros(n))
+
+    def step(self, seen: Measured, memory: Memory) -> tuple[Floats, Floats, Memory]:
+        """Pull speed and heater power above nominal, and the new memory."""
+        starts = memory.started == 0.0
+        applied = np.stack([seen.v_p, seen.Q_H], axis=-1)
+        drift_moved = self.design.noise.recipe_share * (memory.plan[:, 1, 1] - memory.plan[:, 1, 0])
+        state = self.estimator(len(applied)).step(memory.filter, applied, drift_moved, seen, starts)
+        plan = look_ahead(memory.plan, seen, starts, self.control_interval)
+        # Moves start from the applied inputs, the heater's corrected by the resolution of its drive.
+        slack = np.array([0.0, self.design.heater_slack])
+        previous = applied + np.where(starts[:, None], 0.0, np.clip(memory.command - applied, -slack, slack))
+        inputs = self.law(state.mean, plan, previous)
+        return inputs[:, 0], inputs[:, 1], Memory(state, plan, inputs, np.ones(len(inputs)))
+
+    def puzzled(self, memory: Memory) -> Any:
+        """Whether its model does not explain the readings: the innovations have a mean that noise has not."""
+        warmth, width = np.abs(memory.filter.surprise).T
+        return np.maximum(0.5 * warmth, width) > PUZZLING
+
+    def law(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
+        """The regulator's inputs [m/s, W], deviations within the drives' range, shape (n, 2).
+
+        ``estimate`` has shape (n, states), ``plan`` (n, 2, samples + 1), ``previous`` (n, 2). The drift is expected to
+        follow the noise model's ``recipe_share`` of the recipe's movement.
+        """
+        law, recipe_share = self.gains.regulator, self.design.noise.recipe_share
+        error = estimate[:, : len(STATES)].copy()
+        error[:, 0] -= plan[:, 0, 0]
+        if self.design.error_pull is not None:
+            reach = abs(self.design.error_pull * law.feedback[..., 0, len(STATES)] / law.feedback[..., 0, 0])
+            error[:, 0] = np.clip(error[:, 0], -reach, reach)
+        ahead = np.diff(plan, axis=-1)
+        moves = -(law.feedback @ np.concatenate([error, previous], axis=-1)[..., None])[..., 0]
+        moves += (ahead[:, :1] @ law.reference)[:, 0] + recipe_share * (ahead[:, 1:] @ law.drift)[:, 0]
+        limit = np.array([self.v_0, self.heater_range])
+        inputs: Floats = np.clip(previous + moves, -limit, limit)
+        return inputs
+
+
+@lru_cache(maxsize=2)
+def _bank(controller: LQG, hypotheses: Hypotheses, n: int) -> MultipleModelFilter:
+    return multiple_model_filter(controller.gains.filter, hypotheses, n)

@@ -1,1 +1,0 @@
-"""Linear-quadratic-Gaussian control: model, Kalman filter, regulator, shipped settings."""

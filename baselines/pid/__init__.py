@@ -1,1 +1,0 @@
-"""PID controllers: the paper's, filtered, re-tuned and conventional ones."""

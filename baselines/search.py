@@ -1,0 +1,211 @@
+"""A search of a controller's settings: candidates, history, resume, choice on validation seeds.
+
+SciPy's COBYLA proposes candidates, which are scored on training seeds and stored in a file; the best of the finalists
+on validation seeds is chosen. COBYLA is deterministic: the same command meets the candidates of a search that was
+stopped again, measures none of them again, and continues.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.config import Config
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.puller.file import DEFAULT
+from cz_gym.support.errors import CzError
+from cz_gym.support.files import check_writable, naming, write_files
+
+from .lqg import STEP_TIME
+from .policy import Floats
+from .tuned import Figures, Goal, value_at, with_values
+
+FIRST_STEP = 0.5
+"""COBYLA's first step, in natural logarithms of the parameters."""
+QUICK_STEP = 0.05
+"""Step of COBYLA below which a quick search ends, in the same units."""
+FINALISTS = 3
+"""Number of candidates that are scored on validation seeds, on twice as many episodes as training candidates."""
+SURVIVAL_SEEDS = TRAINING_SEEDS[100_000:]
+"""Training seeds of the episodes that only have to be survived: a fifth of the episodes of a candidate."""
+
+
+class Trial(NamedTuple):
+    """A scored candidate."""
+
+    values: tuple[float, ...]
+    """Values of the parameters, in their order."""
+    score: float
+    """What the search minimises."""
+    facts: dict[str, Any]
+    """Figures behind the score."""
+
+
+Measure = Callable[[Any, Config, Sequence[int]], Any]
+
+
+def measure(policy: Any, config: Config, seeds: Sequence[int]) -> Figures:
+    """Run a controller on those episodes; figures have six digits, as in the history."""
+    means, per_step = metrics(rollout(policy, config, seeds)), STEP_TIME / config.control_interval
+    values = (
+        means.rmse_observable_mm.mean(),
+        per_step * means.pull_step_rms_mm_per_min.mean(),
+        per_step * means.heater_step_rms_kw.mean(),
+        1.0 - means.mean_pull_within_3pct.mean(),
+        means.return_.mean(),
+        means.failure_rate.mean(),
+    )
+    return Figures._make([*(float(f"{value:.6g}") for value in values), config.steps])
+
+
+class _Spent(Exception):
+    """Ends COBYLA when all candidates are tried: by itself it tries at least its number of variables plus two."""
+
+
+class Search:
+    """The search of a controller's settings in an environment."""
+
+    def __init__(
+        self,
+        controller: str,
+        goal: Goal,
+        config: Config,
+        trials: int,
+        episodes: int,
+        measure: Measure = measure,
+        quick: bool = False,
+    ) -> None:
+        """At most ``trials`` candidates, each on ``episodes`` training episodes; a ``quick`` search ends at QUICK_STEP,
+        and only its finalists have to survive other scenarios.
+        """
+        self.controller, self.goal, self.config, self.measure, self.quick = controller, goal, config, measure, quick
+        self.budget, self.trials = {"trials": trials, "episodes": episodes}, list[Trial]()
+        self.path: Path | None = None
+        """File of the trials; None for none."""
+        self._paths = [parameter.path for parameter in goal.parameters]
+
+    @property
+    def first(self) -> tuple[float, ...]:
+        """The values with which the search begins: those of the goal's start, within their ranges."""
+        return tuple(p.value(p.coordinate(value_at(self.goal.start, p.path))) for p in self.goal.parameters)
+
+    def settings(self, values: Iterable[float]) -> Any:
+        """The settings with these values of the parameters."""
+        return with_values(self.goal.start, dict(zip(self._paths, values, strict=True)))
+
+    def explore(self) -> None:
+        """Minimise the objective with COBYLA while every limit is kept."""
+        from scipy.optimize import NonlinearConstraint, minimize
+
+        goal = self.goal
+
+        def tried(point: Floats) -> tuple[tuple[float, ...], Any]:
+            values = tuple(p.value(x) for p, x in zip(goal.parameters, point, strict=True))
+            trial = {trial.values: trial for trial in self.trials}.get(values)
+            if trial is None and len(self.trials) >= self.budget["trials"]:
+                raise _Spent
+            return values, goal.kind(**(trial or self.add(values)).facts["figures"])
+
+        def objective(point: Floats) -> float:
+            return goal.objective(tried(point)[1])
+
+        def distances(point: Floats) -> tuple[float, ...]:
+            values, figures = tried(point)
+            policy = goal.policy(self.settings(values), self.config)
+            return tuple(limit(figures, policy) for limit in goal.limits)
+
+        start = np.array([p.coordinate(value) for p, value in zip(goal.parameters, self.first, strict=True)])
+        limits: Any = [NonlinearConstraint(distances, 0.0, np.inf)] if goal.limits else []
+        last_step = QUICK_STEP if self.quick else 1e-3
+        most = max(self.budget["trials"], len(start) + 2)
+        options: Any = {"maxiter": most, "rhobeg": FIRST_STEP, "tol": last_step}
+        with suppress(_Spent):
+            minimize(objective, start, method="COBYLA", constraints=limits, options=options)
+
+    def add(self, values: tuple[float, ...]) -> Trial:
+        """Score a candidate on training episodes; one that would be the best must also survive other scenarios."""
+        episodes = self.budget["episodes"]
+        best = min((trial.score for trial in self.trials), default=math.inf)
+        trial = self._scored(values, TRAINING_SEEDS[:episodes], 0 if self.quick else episodes // 5, best)
+        self.trials.append(trial)
+        self._write({})
+        return trial
+
+    def _scored(self, values: tuple[float, ...], seeds: Sequence[int], survive: int, below: float = math.inf) -> Trial:
+        """The candidate's trial on those seeds; survival counts if its score is ``below`` a limit."""
+        settings = self.settings(values)
+        policy = self.goal.policy(settings, self.config)
+        figures = self.measure(policy, self.config, seeds)
+        score = self.goal.cost(figures, policy)
+        lost: dict[str, float] = {}
+        if survive and score < below:
+            for name in self.goal.survive:
+                config = self.config.with_scenario(name)
+                other = self.goal.policy(settings, config)
+                lost[name] = self.measure(other, config, SURVIVAL_SEEDS[:survive]).failure_rate
+        facts = {"figures": figures._asdict(), "lost": lost}
+        return Trial(values, score + self.goal.failure_price * sum(lost.values()), facts)
+
+    def best(self, count: int) -> list[Trial]:
+        """The best candidates, best first."""
+        return sorted(self.trials, key=lambda trial: trial.score)[:count]
+
+    def tune(self, path: Path) -> Trial:
+        """Search, choose, and write the file at ``path``; a search that was stopped continues from its file."""
+        check_writable(path.parent)
+        self.path = path
+        if path.exists():
+            self._read(path)
+        self.explore()
+        twice = 2 * self.budget["episodes"]
+        finalists = [self._scored(trial.values, VALIDATION_SEEDS[:twice], twice) for trial in self.best(FINALISTS)]
+        judged = sorted(finalists, key=lambda trial: trial.score)
+        entries = [
+            {"score": trial.score, "values": dict(zip(self._paths, trial.values, strict=True)), **trial.facts}
+            for trial in judged
+        ]
+        self._write({"chosen": entries[0], "finalists": entries})
+        return judged[0]
+
+    def _read(self, path: Path) -> None:
+        """Take up the trials of a file; CzError if it is none, or of another search."""
+        try:
+            with naming(path):
+                file = json.loads(path.read_text("utf-8"))
+            parameters, puller = file["parameters"], file.get("puller", DEFAULT.label)
+            crystals = file["scenario_hash"], file.get("control_interval_s", self.config.puller.control_interval)
+            self.trials = [Trial(tuple(values), score, facts) for values, score, facts in file["history"]]
+            episodes = file["budget"]["episodes"]
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise CzError(f"{path} is no history of this search: {error!r}") from None
+        if parameters != self._paths:
+            raise CzError(f"{path}: its parameters are not those of {self.controller}: remove it to begin anew")
+        if puller != self.config.puller.label:
+            raise CzError(f"{path}: found for puller {puller}: remove it to begin anew")
+        if crystals != (self.config.scenario.hash, self.config.control_interval):
+            raise CzError(f"{path} was begun on other crystals or at another control interval: write another file")
+        if episodes != self.budget["episodes"]:
+            raise CzError(f"{path} was begun with {episodes} episodes; ask for as many, or write another file")
+
+    def _write(self, choice: Mapping[str, Any]) -> None:
+        if self.path is None:
+            return
+        about: dict[str, Any] = {
+            "controller": self.controller,
+            "scenario": self.config.scenario.name,
+            "scenario_hash": self.config.scenario.hash,
+            "budget": self.budget,
+        }
+        if self.config.puller != DEFAULT:
+            about["puller"] = self.config.puller.label
+        if self.config.control_interval != self.config.puller.control_interval:
+            about["control_interval_s"] = self.config.control_interval
+        lines = ",\n  ".join(map(json.dumps, self.trials))
+        head = json.dumps({**about, **choice, "parameters": self._paths}, indent=1).removesuffix("\n}")
+        write_files({self.path: f'{head},\n "history": [\n  {lines}\n ]\n}}\n'.encode()})

@@ -1,0 +1,210 @@
+"""``cz-gym benchmark``: controllers and agents on the same disturbed crystals, in one table."""
+
+import argparse
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from cz_gym.agents import OnnxPolicy, shipped_names, shipped_seeds
+from cz_gym.crystal.process import CRYSTAL
+from cz_gym.evaluation import user_code
+from cz_gym.evaluation.protocol import CRYSTAL_CASES, ENVIRONMENTS, SLOW_EPISODES, Case, Contender, agent, find_case
+from cz_gym.puller.file import chosen_puller
+from cz_gym.support.command_line import OneLineParser, between, guarded, shown
+from cz_gym.support.errors import CzError
+from cz_gym.support.names import unknown
+from cz_gym.support.units import MM
+from cz_gym.tools.report.markdown import terminal
+
+from . import registry
+from .files import check_targets, write
+from .run import check_agents, is_cached, run
+
+CLONE = Path(__file__).resolve().parents[2]
+RESULTS = CLONE / "results" if (CLONE / "results" / "benchmark").is_dir() else Path("runs")
+"""Folder of the committed results in a clone, of a user's results elsewhere."""
+FOLDER = RESULTS / "benchmark"
+CRYSTALS = RESULTS / "crystal"
+"""The same of whole crystals."""
+README, CRYSTAL_PAGE = CLONE / "README.md", CLONE / "docs" / "crystal.md"
+"""Pages of a clone that quote the committed results between two markers."""
+OWN = Path("runs")
+"""Folder of results with the user's own controllers, agents or scenarios, each in a folder of their names."""
+CACHE = RESULTS / "cache"
+"""Folder of cached episodes of slow controllers."""
+BOUNDS = RESULTS / "bounds"
+"""Folder of committed results of the slow controllers; their bound serves runs without one."""
+EPISODES = 500
+"""Number of test episodes: of the committed results, and the largest there is."""
+
+
+def parse(argv: Sequence[str]) -> argparse.Namespace:
+    """Read the command line; exits with code 2 and one line for anything that cannot be meant."""
+    parser = OneLineParser(
+        prog="cz-gym benchmark",
+        description="Run controllers and agents on the same disturbed crystals and compare them.",
+        epilog="docs/benchmark.md has the protocol, the formula of every metric and how to add a controller.",
+    )
+    add = parser.add_argument
+    about = "environment (%(default)s); of a whole crystal the scenarios are its stages"
+    add("--env", choices=ENVIRONMENTS, default="Cz-v0", help=about)
+    about = "first N test episodes (%(default)s)"
+    add("--episodes", type=between(1, EPISODES), default=EPISODES, metavar="N", help=about)
+    add("--controllers", type=_names, metavar="A,B", help='controllers and agents by name, or "all"')
+    add("--scenarios", type=_names, metavar="A,B", help="scenarios by name")
+    add("--out", type=Path, metavar="DIR", help=f"folder for the results ({shown(FOLDER)}; of your own: runs/NAME)")
+    add("--json", type=Path, metavar="FILE", help="write benchmark.json to FILE, and only that unless --out is given")
+    agent_help = (
+        "agent file, by default in place of the shipped ones; those of one NAME (default: the algorithm's) are "
+        "training seeds of one agent"
+    )
+    add("--agent", type=_agent_file, action="append", default=[], metavar="[NAME=]FILE", help=agent_help)
+    own = "controller of your own, beside the classical ones of README's table unless --controllers names some"
+    add("--controller", action="append", default=[], metavar="FILE.py:NAME", help=own)
+    own = "scenario of your own, in place of others; or a log's disturbances, FILE.csv (identify --series)"
+    add("--scenario", action="append", default=[], metavar="FILE.py:NAME", help=own)
+    parser.add_puller("every case runs on it, with the controllers that are designed for it")
+    about = "largest deviation of the diameter that is no scrap, in the report for --puller [mm] (1)"
+    add("--tolerance", type=float, metavar="MM", help=about)
+    add("--slow", action="store_true", help=f"slow controllers too, on 50 episodes; resumed from {shown(CACHE)}")
+    parser.add_cluster()
+    add("--overwrite", action="store_true", help="replace files of earlier or other runs")
+    add("--quiet", action="store_true", help="no progress bar, no table; a bar is shown on a terminal only")
+    given = parser.parse_args(argv)
+    return given
+
+
+def _names(text: str) -> list[str]:
+    names = list(dict.fromkeys(name.strip() for name in text.split(",")))
+    if not all(names):
+        raise argparse.ArgumentTypeError(f"must be names with commas between, not {text!r}")
+    return names
+
+
+def _agent_file(text: str) -> tuple[str, Path]:
+    """The name of an agent, "" for its algorithm's, and its file."""
+    name, equals, file = text.partition("=")
+    return (name, Path(file)) if equals and name and "/" not in name else ("", Path(text))
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the benchmark; 0 when done, 2 for bad input, 130 when interrupted."""
+    arguments = parse(argv)
+    if arguments.out is None and arguments.json is None:
+        mine = [place.rpartition(":")[2] for place in (*arguments.controller, *arguments.scenario)]
+        mine += [name or file.stem for name, file in arguments.agent]
+        mine += [Path(arguments.puller).stem] if arguments.puller else []
+        arguments.out = OWN / "-".join(dict.fromkeys(mine)) if mine else folder_of(arguments)
+    command = shlex.join(["cz-gym", "benchmark", *argv])
+    return guarded("cz-gym benchmark", lambda: benchmark(arguments, command), "benchmark")
+
+
+def folder_of(arguments: argparse.Namespace) -> Path:
+    """Folder of the committed results of an environment."""
+    return CRYSTALS if arguments.env == "CzCrystal-v0" else FOLDER
+
+
+def registered(arguments: argparse.Namespace) -> tuple[Contender, ...]:
+    """The controllers of an environment."""
+    return registry.CRYSTAL_CONTROLLERS if arguments.env == "CzCrystal-v0" else registry.CONTROLLERS
+
+
+def benchmark(arguments: argparse.Namespace, command: str) -> int:
+    """Check the arguments, run the benchmark, write and print the results."""
+    cases = cases_of(arguments)
+    contenders = contenders_of(arguments, cases)
+    smaller = is_partial(arguments, contenders, cases)
+    check_targets(arguments.out, arguments.json, smaller, arguments.overwrite)
+    if arguments.out is not None:  # a missing package is named before the work, not after it
+        import matplotlib  # noqa: F401
+        import plotly  # noqa: F401
+    bounds = None if arguments.puller or cases[0].process == CRYSTAL else BOUNDS
+    results = run(contenders, cases, arguments.episodes, CACHE, bounds, arguments.quiet, arguments.cluster)
+    renewed = not smaller and arguments.out and arguments.out.resolve() == folder_of(arguments)
+    quoted = (README, CRYSTAL_PAGE) if renewed else ()
+    write(arguments.out, arguments.json, results, command, quoted)
+    if not arguments.quiet:
+        print(terminal(results))
+        slow = {each.name for each in registered(arguments) if each.slow} - {each.name for each in contenders}
+        if arguments.controllers == ["all"] and slow:
+            names = ", ".join(sorted(slow))
+            print(f"left out of all: {names}, which are slow and not cached for every episode; add --slow to run them")
+        wrote = ", ".join(shown(path) for path in (arguments.out, arguments.json) if path)
+        print(f"wrote {wrote}" + (f"; open {shown(arguments.out / 'report.html')}" if arguments.out else ""))
+    return 0
+
+
+def cases_of(arguments: argparse.Namespace) -> list[Case]:
+    """Scenarios that the command line asks for, as cases of the protocol."""
+    known = ENVIRONMENTS[arguments.env]
+    graded = arguments.puller and known is not CRYSTAL_CASES
+    if arguments.tolerance is not None and not (graded and 0.0 < arguments.tolerance <= 50.0):
+        raise CzError(f"--tolerance {arguments.tolerance:g} must be up to 50 mm, beside --puller FILE.toml, of Cz-v0")
+    names = arguments.scenarios or [case.name for case in known if case.default and not arguments.scenario]
+    cases = [*(find_case(name, known) for name in names), *map(user_code.case, arguments.scenario)]
+    user_code.check_apart([case.name for case in cases], "scenario")
+    puller = chosen_puller(arguments.puller)
+    tolerance = 0.5 * MM * (arguments.tolerance or 1.0) if graded else None
+    return [replace(case, puller=puller, tolerance=tolerance, process=known[0].process) for case in cases]
+
+
+def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[Contender]:
+    """Controllers and agents that the command line asks for, classical controllers first; CzError for unknown ones.
+
+    Those of the user's files always take part, shipped agents by default if no agent is given, slow controllers if
+    ``--slow`` asks for them, or if they are named and all their episodes cached.
+    """
+    own, given = [user_code.controller(place) for place in arguments.controller], given_agents(arguments)
+    controllers, shipped = registered(arguments), shipped_names(arguments.env)
+    names = [each.name for each in controllers]
+    new = [name for name in given if name not in shipped]
+    user_code.check_apart([*names, *shipped, *new, *(each.name for each in own)], "controller")
+
+    def may_run(each: Contender) -> bool:
+        return not each.slow or arguments.slow or is_cached(each, cases, arguments.episodes, CACHE)
+
+    wanted, agents = arguments.controllers, list(given) or ([] if arguments.puller else shipped)
+    if not wanted and arguments.puller:
+        wanted = [each.name for each in controllers if each.on_puller] + agents
+    elif not wanted and own and not arguments.slow:
+        wanted = [each.name for each in controllers if each.quoted]
+    elif not wanted:
+        usual = [each for each in controllers if (arguments.slow if each.slow else each.default)]
+        wanted = [each.name for each in usual] + agents
+    elif wanted == ["all"]:
+        wanted = [each.name for each in controllers if may_run(each)] + agents
+    for name in wanted:
+        if name not in (known := [*names, *new, *shipped]):
+            raise CzError(unknown("controller", name, known, ", or all"))
+    chosen = [each for each in controllers if each.name in wanted]
+    for each in chosen:
+        if not may_run(each):
+            raise CzError(f"{each.name!r} is slow: add --slow to run it on the first {SLOW_EPISODES} episodes")
+    files = {name: shipped_seeds(name) for name in shipped if name in wanted and name not in given}
+    chosen += [*given.values(), *(agent(name, [*map(OnnxPolicy.load, some)]) for name, some in files.items())]
+    check_agents(chosen, cases)
+    if not (chosen or own):
+        raise CzError("no controller takes part: name some with --controllers")
+    return [*chosen, *own]
+
+
+def given_agents(arguments: argparse.Namespace) -> dict[str, Contender]:
+    """Agents of files by name: the files of one name are its training seeds."""
+    policies: dict[str, list[OnnxPolicy]] = {}
+    for name, file in arguments.agent:
+        if str(file) in shipped_names(arguments.env) and not file.exists():
+            raise CzError(f"--agent takes a file; {file} is shipped and runs by its name: --controllers {file}")
+        policy = OnnxPolicy.load(file)
+        policies.setdefault(name or policy.contract.algorithm, []).append(policy)
+    return {name: agent(name, some, own=True) for name, some in policies.items()}
+
+
+def is_partial(arguments: argparse.Namespace, contenders: Sequence[Contender], cases: Sequence[Case]) -> bool:
+    """Whether the run holds less than the default one, or something of the user's own."""
+    usual = {each.name for each in registered(arguments) if each.default and not each.slow}
+    usual |= set(shipped_names(arguments.env))
+    usual_cases = {case for case in ENVIRONMENTS[arguments.env] if case.default}
+    missing = usual - {each.name for each in contenders} or usual_cases - set(cases)
+    own = arguments.agent or arguments.controller or arguments.scenario or arguments.puller
+    return bool(arguments.episodes < EPISODES or missing or own)

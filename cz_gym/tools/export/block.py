@@ -1,0 +1,397 @@
+"""The ports of a block: its inputs, settings, outputs and alarm bits, and its readings in SI units."""
+
+import inspect
+import math
+import re
+from collections.abc import Mapping
+from enum import IntFlag
+from functools import cache, reduce
+from operator import and_
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cz_gym.body.signals import Measured, moved_mean
+from cz_gym.config import Config
+from cz_gym.physics.plant import Puller, make_puller
+from cz_gym.process import scales
+from cz_gym.spaces import CLIP, MEASURED, readable
+from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
+
+from .trace import FINITE, PASSES, Floats, Port
+
+NO_LIMIT = 1e30
+"""A slew rate that limits nothing."""
+
+
+class Alarm(IntFlag):
+    """The bits of ``alarms``."""
+
+    RING = 1
+    """The ring reading is invalid, too old, or outside its range; the last good one is held."""
+    PYROMETER = 2
+    """The pyrometer is outside its range, has jumped, or has not changed for 2 min; the last good reading is held."""
+    DRIVES = 4
+    """An applied drive is no number or outside its range; the last setpoint is held."""
+    REFERENCE = 8
+    """The same of a reference or its preview; the last good one is held."""
+    LATE = 16
+    """The call came more than a tenth of the control interval late."""
+    CLOCK = 32
+    """The time stood still, ran back, or was no number."""
+    PULL_LIMITED = 64
+    """The pull speed's range or slew rate cut its setpoint."""
+    HEATER_LIMITED = 128
+    """The heater's range or slew rate cut its setpoint."""
+    TAKEOVER = 256
+    """The setpoints still move from the drives found at a takeover to the controller's."""
+    FALLBACK = 512
+    """The PID controls instead of the controller, until reset or the next takeover."""
+    FAILED = 1024
+    """The controller's output was no number."""
+    MANUAL = 2048
+    """The controller does not act: ``automatic`` is not set, a setting is wrong, or a drive was never read. The
+    setpoints follow the applied drives."""
+    SETTINGS = 4096
+    """A setting is no number, or a range or a slew rate is in the wrong order."""
+    ASTRAY = 8192
+    """A drive has not followed its setpoint for a minute; its setpoint stays near it."""
+    MODEL = 16384
+    """The controller's model does not explain the readings: the PID takes over."""
+
+
+def meanings(kind: Any) -> dict[Any, str]:
+    """The members of an enumeration with the docstrings below them."""
+    members = re.findall(r'^    (\w+) = \d+\n    """(.*?)"""', inspect.getsource(kind), re.MULTILINE | re.DOTALL)
+    return {kind[name]: " ".join(text.split()) for name, text in members}
+
+
+INPUTS = (
+    Port("time_s", "time of this call"),
+    Port("ring_time_s", "time of the ring reading"),
+    Port("ring_radius_mm", "radius of the bright ring, as the camera gives it"),
+    Port("valid", "whether the camera says that the reading is good", 1.0, True),
+    Port("r_ref_mm", "radius reference now"),
+    Port("r_ref_1min_mm", "radius reference in 1 minute"),
+    Port("r_ref_5min_mm", "radius reference in 5 minutes"),
+    Port("T_1_ref_K", "recipe of the heater temperature now"),
+    Port("T_1_ref_1min_K", "recipe in 1 minute"),
+    Port("T_1_ref_5min_K", "recipe in 5 minutes"),
+    Port("T_1_K", "pyrometer reading of the heater temperature"),
+    Port("pull_speed_mm_per_min", "applied pull speed"),
+    Port("heater_power_kW", "applied heater power"),
+    Port("automatic", "whether the controller acts; a rising edge is a takeover", 1.0, True),
+)
+"""The inputs of every block."""
+READINGS = {
+    **{name: (f"{name}_mm", "nominal_radius_mm", "r_0", MM) for name in ("r_ref", "r_ref_1min", "r_ref_5min")},
+    **{f"T_1{end}": (f"T_1{end}_K", "nominal_T_1_K", "T_1_0", 1.0) for end in ("_ref", "_ref_1min", "_ref_5min", "")},
+    "v_p": ("pull_speed_mm_per_min", "nominal_pull_speed_mm_per_min", "v_0", MM_PER_MIN),
+    "Q_H": ("heater_power_kW", "nominal_heater_power_kW", "Q_H_0", KILO),
+}
+"""Readings but the ring: input, setting with its nominal value, that of a puller, and the input's unit."""
+OUTPUTS = (
+    Port("pull_speed_setpoint_mm_per_min", "setpoint of the pull speed"),
+    Port("heater_power_setpoint_kW", "setpoint of the heater power"),
+    Port("alarms", "sum of the alarm bits"),
+)
+"""The outputs of every block."""
+SETPOINTS = dict(zip((port.name for port in OUTPUTS), ("pull_speed_mm_per_min", "heater_power_kW"), strict=False))
+"""The setpoints, and the applied drives that follow them."""
+
+
+def nominal_puller(config: Config) -> Puller:
+    """The puller at its operating point that a block is made for."""
+    return _puller(config.parameters, config.meniscus)
+
+
+_puller = cache(lambda parameters, meniscus: make_puller(parameters, 0.5, meniscus))
+
+
+def settings_of(config: Config, puller: Puller | None = None) -> tuple[Port, ...]:
+    """The settings of a block for an environment's puller, or for one that was drawn there; its file's limits of the
+    drives are the defaults.
+    """
+    puller, drives = puller or nominal_puller(config), config.puller
+    v_0, Q_0 = puller.v_0 / MM_PER_MIN, puller.Q_H_0 / KILO
+    window = min(puller.v_0, math.inf if drives.pull_window is None else drives.pull_window) / MM_PER_MIN
+    fastest = min(v_0 + window, math.inf if drives.pull_max is None else drives.pull_max / MM_PER_MIN)
+    pull_slew = NO_LIMIT if drives.pull_slew is None else drives.pull_slew / (MM_PER_MIN / MINUTE)
+    heater_slew = NO_LIMIT if drives.heater_slew is None else drives.heater_slew / (KILO / MINUTE)
+    reach, interval = config.heater_range / KILO, config.control_interval
+    latency = max(each.sensor.latency for each in config.scenario.scenarios)
+    return (
+        Port("nominal_radius_mm", "crystal radius at the operating point", puller.r_0 / MM),
+        Port("ring_bias_mm", "the operator's bias: ring radius minus crystal radius at nominal", puller.ring_bias / MM),
+        Port("nominal_pull_speed_mm_per_min", "this puller's pull speed at its operating point", v_0),
+        Port("nominal_heater_power_kW", "this puller's heater power there", Q_0),
+        Port("nominal_T_1_K", "this puller's pyrometer reading there", puller.T_1_0),
+        Port("pull_speed_min_mm_per_min", "lowest setpoint of the pull speed", v_0 - window),
+        Port("pull_speed_max_mm_per_min", "highest setpoint of the pull speed", fastest),
+        Port("heater_power_min_kW", "lowest setpoint of the heater power", max(Q_0 - reach, 0.0)),
+        Port("heater_power_max_kW", "highest setpoint of the heater power", Q_0 + reach),
+        Port("pull_slew_mm_per_min2", "largest change of the pull speed in a minute; 1e30: no limit", pull_slew),
+        Port("heater_slew_kW_per_min", "largest change of the heater power in a minute; 1e30: no limit", heater_slew),
+        Port("takeover_s", "time from a takeover to the controller's full authority", 60.0),
+        Port("fallback_after_s", "time without good readings after which the PID takes over", 240.0),
+        Port("oldest_reading_s", "age from which a ring reading counts as stale", latency + 3.0 * interval),
+        Port("gap_s", "time without a call after which the next one is a takeover", max(10.0 * interval, 30.0)),
+    )
+
+
+def readings_of(given: Any, ranges: tuple[float, float]) -> tuple[Measured, Measured]:
+    """Readings as deviations in SI units, and whether each lies within the range of the observations; the mean pull
+    speed, which is no reading, is the pull speed."""
+    seen = {each: (given[port] - given[nominal]) * unit for each, (port, nominal, _, unit) in READINGS.items()}
+    ring = (given["ring_radius_mm"] - given["ring_bias_mm"] - given["r_ref_mm"]) * MM
+    read = Measured(ring_error=ring, valid=np.where(given["valid"] > 0.5, 1.0, 0.0), v_p_mean=seen["v_p"], **seen)
+    limits = 1.001 * CLIP * scales(MEASURED, *ranges)
+    return read, Measured(*(np.abs(value) <= limit for value, limit in zip(read, limits, strict=True)))
+
+
+def in_plant_units(seen: Measured, puller: Any) -> dict[str, Any]:
+    """The readings of a sample as a plant has them, by the names of :data:`INPUTS`: the inverse of readings_of."""
+    ring = (seen.ring_error + seen.r_ref + puller.r_0 + puller.ring_bias) / MM
+    return {"ring_radius_mm": ring, "valid": seen.valid} | {
+        port: (getattr(seen, each) + getattr(puller, at_rest)) / unit
+        for each, (port, _, at_rest, unit) in READINGS.items()
+    }
+
+
+def in_shares(setpoints: Mapping[str, Any], config: Config) -> Floats:
+    """Setpoints by their names in :data:`OUTPUTS` as shares of the drives' ranges above nominal, shape (..., 2)."""
+    puller, (pull, heater, _) = nominal_puller(config), OUTPUTS
+    power = setpoints[heater.name] * KILO - puller.Q_H_0
+    return np.stack([setpoints[pull.name] * MM_PER_MIN / puller.v_0 - 1.0, power / config.heater_range], axis=-1)
+
+
+# A sample of a block: what the time of a call means, which readings are good, what the drives do.
+
+JUMP, MEND = 8.0, 0.02 / MINUTE
+"""Largest difference of the pyrometer from what is expected [K], and its growth without a good reading [K/s]."""
+STUCK, SAME = 2.0 * MINUTE, 1e-4
+"""Time after which a pyrometer that changes by less than SAME [K] counts as stuck [s]."""
+FAR = 0.05
+"""Distance from its setpoint from which a drive does not follow, in shares of its range [-]."""
+_INPUTS = {port.name for port in INPUTS}
+
+
+class Facts(NamedTuple):
+    """The numbers of a block's puller that are no settings."""
+
+    dt: float
+    """Control interval [s]."""
+    ranges: tuple[float, float]
+    """:attr:`cz_gym.config.Config.ranges`."""
+    jump: float
+    """Largest jump of the pyrometer [K]."""
+    feed: float
+    """Heater power for a lasting change of the heater temperature [W/K]."""
+    trim: float
+    """Heater power without a pyrometer for a relative deviation of the mean pull speed [W]."""
+    slow: float
+    """Slowest time constant of the temperatures, integral time of that trim [s]."""
+    nominal: tuple[float, float]
+    """Pull speed [mm/min] and heater power [kW] at the operating point: where even the settings are no numbers."""
+
+
+class Memory(NamedTuple):
+    """The memory of the shell, of its controller and of its PID."""
+
+    clock_s: Any
+    """Time up to which samples were taken [s], infinite before the first."""
+    called_s: Any
+    """Time of the last call that took one [s]."""
+    late: Any
+    """1 if that call was late."""
+    samples: Any
+    """Number of samples of that call."""
+    engaged: Any
+    """1 if the last sample was automatic."""
+    since: Any
+    """Time since the takeover [s]."""
+    bad: Any
+    """Time without a good set of readings [s]."""
+    fallback: Any
+    """1 if the PID controls."""
+    pull: Any
+    """Last setpoint of the pull speed [mm/min], infinite before the first."""
+    heater: Any
+    """Last setpoint of the heater power [kW]."""
+    astray: Any
+    """Time for which a drive has not followed [s]."""
+    shown: Any
+    """Last reading of the pyrometer, good or not [K]."""
+    still: Any
+    """Time for which it has not changed [s]."""
+    dark: Any
+    """Time without a good reading of the pyrometer [s]."""
+    level: Any
+    """Mean pull speed above nominal, relative [-]."""
+    calm: Any
+    """Time since the takeover and since the pyrometer was last bad [s]."""
+    off_T_1: Any
+    """Error of the nominal temperature [K], as the takeover found it."""
+    off_Q_H: Any
+    """Error of the nominal power [W]."""
+    readings: Measured
+    """Last good readings, deviations, SI."""
+    controller: Any
+    pid: Any
+
+
+class Call(NamedTuple):
+    """What a call's time means."""
+
+    due: Any
+    """Whether a sample is taken in this pass."""
+    again: Any
+    """Whether another one follows in this call."""
+    later: Any
+    """Whether one went before in this call."""
+    share: Any
+    """1 over the number of samples that are left with this one."""
+    samples: Any
+    """Number of samples of the call."""
+    starts: Any
+    """Whether this is the first call, or the first after a gap."""
+    late: Any
+    sound: Any
+    """Whether the time moves forward."""
+    clock: Any
+    """Time up to which samples will have been taken [s]."""
+
+
+def call_of(dt: float, given: Any, memory: Memory) -> Call:
+    """What the time of a call means for a control interval of dt [s]."""
+    time, begun = given["time_s"], finite(memory.clock_s)
+    later = begun & (time == memory.called_s)
+    behind = np.where(begun, time - memory.clock_s, dt)
+    back, gap = behind < -dt, begun & (time - memory.called_s > given["gap_s"])
+    overdue = (behind > 1.1 * dt) & (time - memory.called_s > 1.1 * dt)
+    late = np.where(later, memory.late > 0.5, begun & overdue)
+    behind = np.where(back | gap, dt, np.minimum(behind, PASSES * dt))
+    due = finite(time) & (behind >= 0.5 * dt)
+    again = due & (behind >= 1.5 * dt)
+    left = 1.0 + np.where(again, 1.0, 0.0) + np.where(behind >= 2.5 * dt, 1.0, 0.0)
+    samples = np.where(later, memory.samples, left)
+    sound = finite(time) & ~back & (~begun | (time > memory.called_s) | (later & due))
+    return Call(due, again, later, 1.0 / left, samples, ~begun | gap, late, sound, time - behind + dt)
+
+
+class Readings(NamedTuple):
+    """The readings of a sample and what is known of them."""
+
+    read: Measured
+    """With the last good one in place of each bad one, ring and drives on their way from the call before; from the
+    nominal values as set."""
+    T_1: Any
+    """The pyrometer's, infinite if it is bad [K]."""
+    plausible: Measured
+    ring: Any
+    """Whether the ring is good."""
+    pyrometer: Any
+    """Whether the pyrometer is good."""
+    reference: Any
+    """Whether references and previews are good."""
+    shown: Any
+    still: Any
+
+
+def sample_of(facts: Facts, call: Call, manual: Any, given: Any, memory: Memory) -> Readings:
+    """The readings of a call; ``manual``: whether the operator answers for them."""
+    seen, plausible = readings_of(given, facts.ranges)
+    age = given["time_s"] - given["ring_time_s"]
+    ring = plausible.ring_error & (seen.valid > 0.5) & (np.abs(age) <= given["oldest_reading_s"])
+    reference = reduce(and_, (getattr(plausible, name) for name in Measured._fields if "ref" in name))
+    first = Measured(*(np.where(good, value, 0.0) for good, value in zip(plausible, seen, strict=True)))
+    last = Measured(*(np.where(call.starts, new, old) for old, new in zip(memory.readings, first, strict=True)))
+    same = ~call.starts & (np.abs(seen.T_1 - memory.shown) <= SAME)
+    still = np.where(same, memory.still + np.where(call.later, 0.0, facts.dt), 0.0)
+    expected = last.T_1 + np.where(reference, seen.T_1_ref - last.T_1_ref, 0.0)
+    near = np.abs(seen.T_1 - expected) <= facts.jump + MEND * memory.dark
+    pyrometer = plausible.T_1 & (still <= STUCK) & (near | manual | call.starts)
+    good = plausible._replace(T_1=pyrometer)
+    trusted = Measured(*(np.where(each, value, np.inf) for each, value in zip(good, seen, strict=True)))
+    read = readable(trusted._replace(valid=np.where(ring, 1.0, 0.0)), last)
+    read = read._replace(T_1=np.where(pyrometer, seen.T_1, np.where(call.starts, 0.0, expected)))
+    moving = {name: (getattr(last, name), getattr(read, name)) for name in ("ring_error", "v_p", "Q_H")}
+    share = np.where(manual, 1.0, call.share)
+    read = read._replace(**{name: old + share * (new - old) for name, (old, new) in moving.items()})
+    mean = np.where(call.starts, read.v_p, moved_mean(last.v_p_mean, read.v_p, facts.dt))
+    read = read._replace(v_p_mean=mean)
+    shown = np.where(finite(seen.T_1), seen.T_1, np.inf)
+    return Readings(read, trusted.T_1, plausible, ring, pyrometer, reference, shown, still)
+
+
+def trimmed(read: Measured, off_T_1: Any, off_Q_H: Any) -> Measured:
+    """The readings from the nominal values less their errors."""
+    temperatures = {name: getattr(read, name) - off_T_1 for name in Measured._fields if name.startswith("T_1")}
+    return read._replace(**temperatures, Q_H=read.Q_H - off_Q_H)
+
+
+def sane_of(given: Any) -> Any:
+    """Whether the settings are numbers in the right order."""
+    ordered = given["pull_speed_min_mm_per_min"] <= given["pull_speed_max_mm_per_min"]
+    ordered = ordered & (given["heater_power_min_kW"] <= given["heater_power_max_kW"])
+    positive = ("pull_slew_mm_per_min2", "heater_slew_kW_per_min", "nominal_pull_speed_mm_per_min", "gap_s")
+    numbers = (finite(given[name]) for name in given if name not in _INPUTS)
+    return reduce(and_, (given[port] > 0.0 for port in positive), reduce(and_, numbers, ordered))
+
+
+class Drive(NamedTuple):
+    """One drive at a sample, in the unit of its port."""
+
+    known: Any
+    """Whether its reading is good."""
+    applied: Any
+    """The reading; without a good one the last setpoint."""
+    held: Any
+    """The last setpoint; before the first one the nominal value."""
+    nominal: Any
+    far: Any
+    """Distance from which it does not follow."""
+    slew: Any
+    """Largest change in a minute."""
+    span: tuple[Any, Any]
+    """Range of its setpoint."""
+
+    @property
+    def away(self) -> Any:
+        """Whether it is far from its last setpoint."""
+        return self.known & (np.abs(self.applied - self.held) > self.far)
+
+    def near(self, setpoint: Any, lost: Any) -> Any:
+        """The setpoint; where the drive does not follow, no farther from it than needed to see that it does again."""
+        return np.where(lost, np.clip(setpoint, self.applied - 2.0 * self.far, self.applied + 2.0 * self.far), setpoint)
+
+    def move(self, old: Any, wanted: Any, share: Any, dt: float) -> tuple[Any, Any]:
+        """The setpoint on its way from ``old`` to a value, and whether range or slew rate cut it."""
+        ends = wanted, np.clip(wanted, *self.span)
+        free, bound = (np.where(share < 1.0, old + share * (to - old), to) for to in ends)
+        most = self.slew * (dt / MINUTE)
+        limit = np.clip(bound, old - most, old + most)
+        return limit, np.abs(limit - free) > 1e-6
+
+
+_PORTS = (
+    ("pull_speed_mm_per_min", "pull_speed_{}_mm_per_min", "nominal_pull_speed_mm_per_min", "pull_slew_mm_per_min2"),
+    ("heater_power_kW", "heater_power_{}_kW", "nominal_heater_power_kW", "heater_slew_kW_per_min"),
+)
+"""Names of each drive's reading, of the ends of its range, its nominal value and its slew rate."""
+
+
+def drive_of(sane: Any, facts: Facts, call: Call, seen: Readings, given: Any, memory: Memory, which: int) -> Drive:
+    """The pull (0) or the heater (1) at a sample."""
+    reading, end, at_rest, slew = _PORTS[which]
+    known = np.where(sane, (seen.plausible.v_p, seen.plausible.Q_H)[which], finite(given[reading]))
+    nominal, last = given[at_rest], (memory.pull, memory.heater)[which]
+    held = np.where(finite(last), last, np.where(finite(nominal), nominal, facts.nominal[which]))
+    span = given[end.format("min")], given[end.format("max")]
+    applied, far = np.where(known, given[reading], held), FAR * (span[1] - span[0])
+    return Drive(known, applied, held, nominal, far, given[slew], span)
+
+
+def finite(value: Any) -> Any:
+    """Whether a number is neither NaN nor infinite, which recorded programs have as large ones."""
+    return np.abs(value) <= FINITE

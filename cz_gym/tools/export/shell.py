@@ -1,0 +1,295 @@
+"""What a plant needs around a controller: takeover, limits, hold, fallback, alarms.
+
+The controller runs on a grid of its own interval. A call makes as many samples as intervals have passed, up to
+:data:`PASSES` of them; after a gap it is a takeover. Readings that are not finite, invalid, too old, outside the range
+of the observations, or of a pyrometer that jumps or stands still are replaced by the last good ones. If that lasts, if
+the controller's output is not finite, or if its model does not explain the readings, the fallback PID takes over until
+the next takeover; without a ring it holds the pull speed, without a pyrometer the heater follows the recipe and the
+pull speed alone. After every takeover the setpoints start at the applied drives and move to the controller's within
+``takeover_s``. All of it is NumPy code on arrays of shape (n,): :meth:`Block.run` runs it on n plants at once, and
+:attr:`Block.program` is its record, from which other languages are written.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, reduce
+from operator import add
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from cz_gym.body.process import INPUTS as COLUMNS
+from cz_gym.body.process import STATES, linearise
+from cz_gym.body.signals import Measured
+from cz_gym.config import Config
+from cz_gym.spaces import MadeFor, decode, mark
+from cz_gym.support.names import select
+from cz_gym.support.units import KILO, MINUTE, MM_PER_MIN
+
+from .block import (
+    INPUTS,
+    JUMP,
+    OUTPUTS,
+    Alarm,
+    Facts,
+    Memory,
+    call_of,
+    drive_of,
+    finite,
+    in_plant_units,
+    in_shares,
+    nominal_puller,
+    sample_of,
+    sane_of,
+    settings_of,
+    trimmed,
+)
+from .trace import PASSES, Floats, Port, Program, record
+
+BLIND = MINUTE
+"""Time for which a controller that estimates the temperature keeps the heater without a pyrometer [s]."""
+ASTRAY = MINUTE
+"""Time after which a drive counts as not following [s]."""
+LEVEL, TRIM_T_1, TRIM_Q_H = 5.0 * MINUTE, 0.5, 0.005
+"""Averaging time of the pull speed [s]; what a takeover leaves of the deviation from the nominal temperature [K] and
+power [share of the heater's range]. The rest counts as an error of the nominal values."""
+SETTLED = 30.0 * MINUTE
+"""Time since a takeover or a bad pyrometer, from which it counts that a model does not explain the readings [s]."""
+SLOWER, FOLLOWED = 1.5, 0.5
+"""How the heater moves without a pyrometer: the time constant of the mean pull speed, in multiples of its averaging
+time, and the share of the recipe's movement that is followed [-]."""
+TEMPERATURES = "T_1", "T_2", "T_b"
+UNKNOWN = "clock_s", "called_s", "pull", "heater", "shown"
+"""Memory that is infinite before the first sample."""
+
+
+class Controller(Protocol):
+    """What the shell is put around, :class:`cz_gym.baselines.policy.MeasuredController` for one."""
+
+    @property
+    def accepts_missing_temperature(self) -> bool:
+        """Whether it is given a pyrometer reading that is not finite as such."""
+
+    def at_rest(self, seen: Measured) -> Any:
+        """The controller's memory before the first sample."""
+
+    def step(self, seen: Measured, memory: Any) -> tuple[Any, Any, Any]:
+        """Pull speed [m/s] and heater power [W] above nominal, and the new memory."""
+
+
+def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memory: Any) -> Any:
+    """Outputs, memory, whether a sample was due and whether another is, for settings and inputs by their names."""
+    dt, sane, call = facts.dt, sane_of(given), call_of(facts.dt, given, memory)
+    automatic, before = (given["automatic"] > 0.5) & sane, (memory.engaged > 0.5) & ~call.starts
+    seen = sample_of(facts, call, ~(automatic & before), given, memory)
+    drives = [drive_of(sane, facts, call, seen, given, memory, which) for which in (0, 1)]
+    known = drives[0].known & drives[1].known
+    engaged = automatic & (before | known)
+    runs = engaged & before
+    away = runs & (drives[0].away | drives[1].away)
+    astray = np.where(call.later, memory.astray, np.where(away, memory.astray + dt, 0.0))
+    good = seen.ring & seen.reference & known
+    bad = np.where(good, 0.0, np.where(call.starts, 0.0, memory.bad) + dt)
+    dark = np.where(seen.pyrometer, 0.0, np.where(call.starts, 0.0, memory.dark) + dt)
+    calm = np.where(runs & seen.pyrometer, memory.calm + dt, 0.0)
+    puzzled = (calm > SETTLED) & (controller.puzzled(memory.controller) if hasattr(controller, "puzzled") else False)
+    fallen = runs & (memory.fallback > 0.5)
+    fallback = runs & (fallen | (bad > given["fallback_after_s"]) | puzzled)
+    since = np.where(runs & (fallen | ~fallback), memory.since + dt, 0.0)
+    share = np.minimum(since / np.maximum(given["takeover_s"], 1e-3), 1.0)
+
+    off_T_1 = np.where(runs, memory.off_T_1, np.where(seen.pyrometer, _beyond(seen.read.T_1, TRIM_T_1), 0.0))
+    off_Q_H = np.where(runs, memory.off_Q_H, _beyond(seen.read.Q_H, TRIM_Q_H * facts.ranges[1]))
+    read = trimmed(seen.read, off_T_1, off_Q_H)
+    nominal = drives[0].nominal, drives[1].nominal + off_Q_H / KILO
+    estimates = controller.accepts_missing_temperature
+    # The samples of a call have one frame in common, whose noise counts once.
+    told = read._replace(T_1=np.where(call.again, np.inf, seen.T_1 - off_T_1), valid=read.valid / call.samples)
+    held = memory.controller if runs.all() else select(runs, memory.controller, controller.at_rest(read))
+    own = controller.step(told if estimates else read, held)
+    other = own[0], own[1], memory.pid
+    if (fallback | ~(finite(own[0]) & finite(own[1]))).any():
+        other = pid.step(read, select(fallen, memory.pid, pid.at_rest(read)))
+    pull, heater = (
+        np.where(fallback, second, first) / unit + at
+        for first, second, unit, at in zip(own[:2], other[:2], (MM_PER_MIN, KILO), nominal, strict=True)
+    )
+    lost = astray > ASTRAY
+    old = [np.where(runs, each.near(each.held, lost), each.applied) for each in drives]
+    level = np.where(call.starts, 0.0, memory.level)
+    level = level + min(dt / LEVEL, 1.0) * (seen.read.v_p / (drives[0].nominal * MM_PER_MIN) - level)
+    blind = ~seen.pyrometer & ((dark > BLIND) | fallback | (not estimates))
+    moved = np.where(seen.reference & ~call.starts, seen.read.T_1_ref - memory.readings.T_1_ref, 0.0)
+    trim = FOLLOWED * facts.feed * moved + facts.trim * (level - memory.level + dt / facts.slow * level)
+    wanted = np.where(fallback & ~seen.ring, old[0], pull), np.where(blind, old[1] + trim / KILO, heater)
+    sound = finite(wanted[0]) & finite(wanted[1])
+    moves = [
+        each.move(start, np.where(sound, target, start), share, dt)
+        for each, start, target in zip(drives, old, wanted, strict=True)
+    ]
+    setpoints = [
+        np.where(call.due, np.where(engaged, each.near(value, lost), each.applied), each.held)
+        for each, (value, _) in zip(drives, moves, strict=True)
+    ]
+    bits = {
+        Alarm.RING: ~seen.ring, Alarm.PYROMETER: ~seen.pyrometer, Alarm.DRIVES: ~known,
+        Alarm.REFERENCE: ~seen.reference, Alarm.LATE: call.late, Alarm.CLOCK: ~call.sound,
+        Alarm.PULL_LIMITED: engaged & moves[0][1], Alarm.HEATER_LIMITED: engaged & moves[1][1],
+        Alarm.TAKEOVER: engaged & (share < 1.0), Alarm.FALLBACK: fallback, Alarm.FAILED: engaged & ~sound,
+        Alarm.MANUAL: ~engaged, Alarm.SETTINGS: ~sane, Alarm.ASTRAY: lost, Alarm.MODEL: puzzled,
+    }  # fmt: skip
+    alarms = reduce(add, (np.where(holds, float(bit), 0.0) for bit, holds in bits.items()))
+    outputs = dict(zip((port.name for port in OUTPUTS), (*setpoints, alarms), strict=True))
+    now = Memory(
+        clock_s=call.clock, called_s=given["time_s"], late=np.where(call.late, 1.0, 0.0),
+        samples=call.samples, engaged=np.where(engaged, 1.0, 0.0), since=since, bad=bad,
+        fallback=np.where(fallback | (engaged & ~sound), 1.0, 0.0), pull=setpoints[0], heater=setpoints[1],
+        astray=astray, shown=seen.shown, still=seen.still, dark=dark, level=level, calm=calm, off_T_1=off_T_1,
+        off_Q_H=off_Q_H, readings=seen.read, controller=own[2], pid=other[2],
+    )  # fmt: skip
+    return outputs, now, call.due, call.again
+
+
+def _beyond(value: Any, most: float) -> Any:
+    """What a value has beyond +-most."""
+    return value - np.clip(value, -most, most)
+
+
+@dataclass(frozen=True)
+class Block:
+    """A controller in its shell, for the puller and the control interval of an environment."""
+
+    name: str
+    controller: Controller
+    pid: Controller
+    """The fallback."""
+    config: Config
+    notes: tuple[str, ...] = ()
+    """Facts for the header of each written file: puller, hashes, scenario."""
+
+    @cached_property
+    def ports(self) -> dict[str, Port]:
+        """Settings and inputs by name."""
+        return {port.name: port for port in (*settings_of(self.config), *INPUTS)}
+
+    def start(self, n: int) -> Memory:
+        """The memory of n blocks before their first sample."""
+        zero = Measured(*(np.zeros(n) for _ in Measured._fields))
+        numbers = (np.full(n, math.inf if name in UNKNOWN else 0.0) for name in Memory._fields[:-3])
+        return Memory._make([*numbers, zero, self.controller.at_rest(zero), self.pid.at_rest(zero)])
+
+    def run(self, inputs: Mapping[str, Any], memory: Memory) -> tuple[dict[str, Floats], Memory]:
+        """The outputs, each of shape (n,), and the next memory, for inputs and settings; missing ones have defaults."""
+        n = len(memory.pull)
+        given = {
+            name: np.broadcast_to(np.asarray(inputs.get(name, port.default), np.float64), (n,))
+            for name, port in self.ports.items()
+        }
+        outputs, again = dict[str, Any](), np.ones(n, np.bool_)
+        for _ in range(PASSES):
+            with np.errstate(all="ignore"):
+                shown, after, due, more = self._step(given, memory)
+            outputs = {name: np.where(again, value, outputs.get(name, value)) for name, value in shown.items()}
+            memory, again = after if due.all() else select(due, after, memory), more
+            if not again.any():
+                break
+        return outputs, memory
+
+    @cached_property
+    def facts(self) -> Facts:
+        """What the shell knows of the puller."""
+        config, puller = self.config, nominal_puller(self.config)
+        hot = linearise(puller, config.meniscus)
+        at = [STATES.index(name) for name in TEMPERATURES]
+        A, B = hot.A[np.ix_(at, at)], hot.B[at, COLUMNS.index("Q_H")]
+        T_1, _, T_b = -np.linalg.solve(A, B)
+        pull = T_b * puller.k_l / (puller.v_0 * puller.rho_dH * puller.h_0)
+        slow = -1.0 / float(np.linalg.eigvals(A).real.max())
+        noise = max(each.sensor.pyrometer_noise[1] for each in config.scenario.scenarios)
+        trim, nominal = slow / (pull * SLOWER * LEVEL), (puller.v_0 / MM_PER_MIN, puller.Q_H_0 / KILO)
+        return Facts(config.control_interval, config.ranges, JUMP + 8.0 * noise, 1.0 / T_1, trim, slow, nominal)
+
+    def _step(self, given: Any, memory: Any) -> Any:
+        return step(self.controller, self.pid, self.facts, given, memory)
+
+    @cached_property
+    def program(self) -> Program:
+        """The record of what it computes."""
+        return record(self._step, self.start(1), (settings_of(self.config), INPUTS, OUTPUTS), self.name, self.notes)
+
+
+# An exported controller in the simulator: a block, in Python or in another language, as a policy.
+
+
+class Runner(Protocol):
+    """What runs n blocks: :class:`Block`, or its compiled form."""
+
+    def start(self, n: int) -> Any:
+        """The memory of n blocks before their first sample."""
+
+    def run(self, inputs: Mapping[str, Any], memory: Any) -> tuple[dict[str, Floats], Any]:
+        """The outputs, each of shape (n,), and the next memory."""
+
+
+class BlockState(NamedTuple):
+    """What a block's policy remembers."""
+
+    samples: npt.NDArray[np.int64]
+    """Number of samples since the episode began, shape (n,)."""
+    memory: Any
+    outputs: Mapping[str, Floats]
+    """Setpoints and alarm bits of the last sample, each of shape (n,)."""
+
+
+@dataclass(frozen=True)
+class BlockPolicy:
+    """A block that acts in the environment that it was exported for.
+
+    The environment's readings are deviations from each crystal's own nominal values; the block gets them added to its
+    nominal ones, so that every puller looks as if it had been calibrated.
+    """
+
+    observation: ClassVar[str] = "measured"
+    action: ClassVar[str] = "direct"
+
+    block: Block
+    runner: Runner | None = None
+    """What runs it in place of Python."""
+    interval: float | None = None
+    """Control interval of the environment, if it is another one than the block's [s]."""
+
+    @property
+    def made_for(self) -> MadeFor:
+        """The environment that takes its actions."""
+        made_for = self.block.config.made_for
+        return made_for._replace(action=self.action, control_interval=self.interval or made_for.control_interval)
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[npt.NDArray[np.float32], Any]:
+        """Actions and the next state; arguments as of every policy."""
+        rows = np.atleast_2d(np.asarray(observation, np.float64))
+        n, runner = len(rows), self.runner or self.block
+        if state is None:
+            state = BlockState(np.zeros(n, np.int64), runner.start(n), {})
+        elif episode_start is not None and np.any(episode_start):
+            samples, memory = select(np.asarray(episode_start), (0 * state.samples, runner.start(n)), state[:2])
+            state = BlockState(samples, memory, state.outputs)
+        outputs, memory = runner.run(self.inputs(rows, state.samples), state.memory)
+        action = self.action_of(outputs)
+        marked = mark(action[0] if np.ndim(observation) == 1 else action, self.made_for)
+        return marked, BlockState(state.samples + 1, memory, outputs)
+
+    def inputs(self, rows: Any, samples: Any) -> dict[str, Any]:
+        """The block's inputs for observations of shape (n, channels) at those samples of their episodes."""
+        config = self.block.config
+        time = samples * (self.interval or config.control_interval)
+        readings = in_plant_units(decode(rows, *config.ranges), nominal_puller(config))
+        return readings | {"time_s": time, "ring_time_s": time, "automatic": 1.0}
+
+    def action_of(self, outputs: Mapping[str, Any]) -> npt.NDArray[np.float32]:
+        """The environment's action for the setpoints, shape (n, 2)."""
+        action: npt.NDArray[np.float32] = np.clip(in_shares(outputs, self.block.config), -1.0, 1.0).astype(np.float32)
+        return action

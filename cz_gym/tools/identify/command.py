@@ -1,0 +1,219 @@
+"""Report of an identification: Markdown with two pictures."""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from cz_gym.episodes.scenario import to_csv
+from cz_gym.evaluation.plots import COLOURS, GREY, INK, canvas, png
+from cz_gym.physics.parameters import describe
+from cz_gym.physics.plant import make_puller
+from cz_gym.puller.file import find_puller, to_toml
+from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.errors import CzError
+from cz_gym.support.files import check_writable, write_files
+from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN, PERCENT
+from cz_gym.tools.report.tables import markdown
+
+from .estimate import COLOURED, Estimate, Identified, coloured, identify
+from .log import COLUMNS, Log, check_puller, column_map, read_log
+from .model import Lags
+
+SENSORS = "pyrometer", "ring"
+CALLIPER = 0.05 * MM
+"""Error of a calliper's reading of the radius [m]."""
+OTHERS = {
+    "lam": ("lam dT_0", "K"),
+    "camera_sd": ("camera noise", "m"),
+    "pyrometer_sd": ("pyrometer noise", "K"),
+    "fast_sd": ("melt, fast fluctuation", "K"),
+    "slow_sd": ("melt, slow fluctuation", "K"),
+    "load_rate": ("hot zone, rate of drift", "1/s"),
+    "heater_lag": ("heater's lag", "s"),
+    "heater_dead_time": ("heater's dead time", "s"),
+    "pyrometer_filter": ("pyrometer's filter", "s"),
+}
+"""Names and units of the numbers that are no parameters."""
+HEADS = "number", "unit", "start", "log", "95 % interval", "uncertainty left [%]", "verdict"
+
+
+def report(identified: Identified, log: Log | Sequence[Log], source: str, path: Path) -> dict[Path, bytes]:
+    """The files of a report, its text at ``path``: what the log ``source`` tells of a puller, and what it does not."""
+    readings, numbers = (path.with_name(f"{path.stem}-{name}.png") for name in ("readings", "numbers"))
+    told = sum(e.informed for e in identified.estimates)
+    moves = zip(("pull speed", "heater"), identified.excitation, strict=True)
+    correlations = [f"{name} {coloured(errors):.2f}" for name, errors in zip(SENSORS, identified.errors.T, strict=True)]
+    logs = (log,) if isinstance(log, Log) else log
+    notes = ["; ".join(each.notes) or "nothing was left out" for each in logs]
+    lines = [f"- {len(each.time)} rows of {each.interval:g} s; {note}." for each, note in zip(logs, notes, strict=True)]
+    text = f"""# {identified.verdict[0].upper() + identified.verdict[1:]}
+
+The log {source} tells {told} of {len(identified.estimates)} numbers of the puller {identified.start.name};
+the others keep the start's values.
+
+{markdown(HEADS, map(_row, (*identified.estimates, *identified.noise)), "---")}
+
+"Uncertainty left" compares the estimate's standard deviation with the start's; below 50 % the log tells the number.
+A log gives lam and dT_0 only as their product, the delays of the heater's path best as their sum, and no phi_b.
+
+![start and estimates]({numbers.name})
+
+## Excitation
+
+{chr(10).join(f"- {name}: {_moved(share)}" for name, share in moves)}
+
+## Predicted and measured
+
+![readings and their prediction errors]({readings.name})
+
+Largest correlation of the prediction errors: {", ".join(correlations)}. Above {COLOURED:g} something moves the readings
+that the model does not have.
+
+## What one calliper reading would add
+
+{_calliper(identified)}
+
+## The log
+
+{chr(10).join(lines)}
+"""
+    return {path: text.encode(), readings: _readings(identified), numbers: _numbers(identified)}
+
+
+def _row(e: Estimate) -> tuple[str, ...]:
+    name, unit = OTHERS.get(e.name) or (e.name, describe()[e.name].unit)
+    if not e.excited:
+        return name, unit, f"{e.prior:.4g}", "-", "-", "-", "not estimated: its drive was not excited"
+    verdict = "told" if e.informed else "this log says nothing about it" if e.trusted else "not to be trusted"
+    if e.name in Lags._fields and not e.trusted:
+        verdict = "no delay, or none that this log shows"
+    interval = f"{e.low:.4g} to {e.high:.4g}"
+    return name, unit, f"{e.prior:.4g}", f"{e.value:.4g}", interval, f"{e.left / PERCENT:.0f}", verdict
+
+
+def _moved(share: float) -> str:
+    if share >= 1.0:
+        return f"moves of its own, {share:.3g} times what is needed"
+    return (
+        f"{share:.2g} of the moves that are needed (the pull speed's count only beside the heater's). The readings "
+        "explain the others, as a controller's moves, and such a log misleads: the numbers of this drive were not "
+        "estimated. `identify.Excited` makes the moves."
+    )
+
+
+def _calliper(identified: Identified) -> str:
+    """What the ring's offset would say of phi_b if the crystal's radius were known."""
+    parameters = (identified.start if identified.misfits else identified.puller).parameters
+    log, step = identified.log, 1e-4
+    ring = make_puller(parameters).ring_bias
+    slope = (make_puller(parameters._replace(phi_b=parameters.phi_b + step)).ring_bias - ring) / step
+    meant = np.where(np.isfinite(log.r_ref), log.r_ref, parameters.r_0)
+    middle = float(np.nanmedian(log.ring - meant))
+    return (
+        f"The ring is {middle / MM:.2f} mm outside the reference, in the middle of the log; with phi_b = "
+        f"{np.degrees(parameters.phi_b):.2f} deg it is {ring / MM:.2f} mm outside the crystal. The log cannot say how "
+        f"much of the difference is an error of the radius. A calliper reading of the crystal, to {CALLIPER / MM:g} mm "
+        f"of its radius, gives phi_b to {np.degrees(CALLIPER / abs(slope)):.2g} deg, and with it the true radius."
+    )
+
+
+def _readings(identified: Identified) -> bytes:
+    """Drives, readings with their predictions, and prediction errors, as PNG."""
+    figure, log, hours = canvas(8.0, 8.0), identified.log, identified.log.time / HOUR
+    drives, ring, pyrometer, errors = figure.subplots(4, 1, sharex=True)
+    drives.plot(hours, log.v_p / MM_PER_MIN, color=COLOURS[1], lw=0.8, label="pull speed [mm/min]")
+    power = drives.twinx()
+    power.plot(hours, log.Q_H / KILO, color=COLOURS[0], lw=0.8, label="heater power [kW]")
+    for axis, values, error, size, label in (
+        (ring, log.ring, identified.predicted.error[:, 1], MM, "ring radius [mm]"),
+        (pyrometer, log.T_1, identified.predicted.error[:, 0], 1.0, "T_1 [K]"),
+    ):
+        axis.plot(hours, values / size, ".", color=GREY, ms=2, label="measured")
+        axis.plot(hours, (values - error) / size, color=COLOURS[1], lw=0.8, label="predicted")
+        axis.set_ylabel(label)
+    for sensor, name in enumerate(SENSORS):
+        errors.plot(hours, identified.errors[:, sensor], ".", color=COLOURS[sensor], ms=2, label=name)
+    drives.set_ylabel("pull speed [mm/min]", color=COLOURS[1])
+    power.set_ylabel("heater power [kW]", color=COLOURS[0])
+    errors.set(xlabel="time [h]", ylabel="error / its sd [-]", ylim=(-5.0, 5.0))
+    for axis in (ring, errors):
+        axis.legend(fontsize=7.5, frameon=False, ncols=2)
+    return png(figure)
+
+
+def _numbers(identified: Identified) -> bytes:
+    """Start and estimates with their 95 % intervals, relative to the start, as PNG."""
+    figure = canvas(7.0, 4.5)
+    axis = figure.subplots()
+    shown = [e for e in identified.estimates if e.name not in Lags._fields]
+    for y, e in enumerate(shown):
+        colour = COLOURS[1] if e.informed else GREY
+        axis.plot([max(e.low, 0.0) / e.prior, e.high / e.prior], [y, y], color=colour, lw=2)
+        axis.plot(e.value / e.prior, y, "o", color=colour)
+    axis.axvline(1.0, color=INK, lw=0.8)
+    axis.set_yticks(range(len(shown)), [OTHERS.get(e.name, (e.name,))[0] for e in shown])
+    axis.invert_yaxis()
+    axis.set_xlabel("estimate / start [-]; grey: this log says nothing about it")
+    return png(figure)
+
+
+# Identify a puller from its logs: ``cz-gym identify LOG.csv --puller start.toml --out my.toml``.
+
+NO_FIT = 3
+"""Exit code where the model does not fit the log."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = OneLineParser("cz-gym identify", "Identify a puller from its logs.")
+    add = parser.add_argument
+    add("log", type=Path, nargs="+", help=f"CSV or Parquet file of one machine, with the columns {', '.join(COLUMNS)}")
+    add("--puller", default="default", help="puller file to start from (default: %(default)s)")
+    add("--out", type=Path, required=True, help="puller file to write; its report stands beside it")
+    about = "write the load on the melt and the fluctuations of the log too, as a scenario: scenario='FILE.csv'"
+    add("--series", type=Path, metavar="FILE.csv", help=about)
+    named = "NAME=COLUMN[:UNIT]"
+    add("--column", action="append", default=[], metavar=named, help="a column with another name or unit")
+    add("--columns", type=Path, metavar="FILE", help='TOML file with lines NAME = "COLUMN:UNIT"')
+    add("--prior", action="append", default=[], metavar="NAME=SD", help="sd of the logarithm of a start value")
+    add("--force", action="store_true", help="write the puller file although the model does not fit the log")
+    return parser.run(_main, arguments, "plant")
+
+
+def _main(given: argparse.Namespace) -> int:
+    pass
+
+    for option, path, suffix in (("--out", given.out, ".toml"), ("--series", given.series, ".csv")):
+        if path is not None and path.suffix != suffix:
+            raise CzError(f"{option} must be a file NAME{suffix}, not {path}")
+        if path is not None:
+            check_writable(path.absolute().parent)
+    start = find_puller(given.puller)
+    if start.file is not None and given.out.exists() and given.out.samefile(start.file):
+        raise CzError(f"--out {given.out} is the file to start from: name another one")
+    logs = [read_log(path, column_map(given.column, given.columns)) for path in given.log]
+    for path, log in zip(given.log, logs, strict=True):
+        check_puller(log, start, str(path))
+    identified = identify(logs, start, dict(map(_prior, given.prior)))
+    page, files = given.out.with_suffix(".md"), dict[Path, bytes]()
+    if given.force or not identified.misfits:
+        files[given.out] = to_toml(replace(identified.puller, name=given.out.stem)).encode()
+        files |= {given.series: to_csv(identified.series()).encode()} if given.series else {}
+    print(identified.verdict)
+    write_files(report(identified, logs, ", ".join(path.name for path in given.log), page) | files)
+    for e in identified.estimates:
+        said = f"{e.value:.4g} ({e.low:.4g} to {e.high:.4g})" if e.informed else "this log says nothing about it"
+        print(f"{e.name}: {said}")
+    print(f"wrote {' and '.join(map(str, (*files, page)))}")
+    return NO_FIT if identified.misfits else 0
+
+
+def _prior(text: str) -> tuple[str, float]:
+    name, _, sd = text.partition("=")
+    try:
+        return name, float(sd)
+    except ValueError:
+        raise CzError(f"--prior {text}: write it as NAME=SD") from None

@@ -1,0 +1,346 @@
+"""Whether a model fits a log: what its prediction errors, its operating point and its noise say."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares, minimize
+
+from cz_gym.physics.meniscus import HURLE, MeniscusModel
+from cz_gym.physics.parameters import Parameters
+from cz_gym.puller.file import DEFAULT, PullerFile
+from cz_gym.support.errors import CzError
+from cz_gym.support.names import unknown
+from cz_gym.support.units import KILO, MM
+
+from .log import Floats, Log, join, prepare, shift_drives
+from .model import FAST, LAM, LOAD, SLOW, Lags, Model, Noise, Predicted, sensitivities, smooth
+from .moves import measure_excitation
+
+ROWS_BACK, COLOURED = 20, 0.15
+"""Lags at which prediction errors are correlated [rows], and the correlation above which the model does not fit [-];
+many rows make smaller ones significant."""
+SEEN = 0.05, 0.01 * MM
+"""Least standard deviation of prediction errors of pyrometer [K] and ring [m] that are judged: no sensor shows less,
+and a model need not be better."""
+FAR = 3.0
+"""Standard deviations of its prior from which on an estimate stands at its end."""
+T_1_OFF, Q_H_OFF = 15.0, 0.06
+"""Largest differences of the model's operating point and the log's means: T_1 [K], share of the power [-]."""
+NOISY = 2.5
+"""Largest ratio of a sensor's noise to what the start file says."""
+
+
+def misfits(identified: Any, puller: Any, away: Mapping[str, float]) -> tuple[str, ...]:
+    """Reasons why the model does not fit the log, in words.
+
+    ``identified`` is an :class:`.estimate.Identified`, ``puller`` its puller with Q_H_0 and T_1_0, ``away`` how far
+    each estimate is from its prior's mean, in standard deviations. Only paths that were estimated are judged; a delay
+    or a noise may well be absent.
+    """
+    pull, heater = (share >= 1.0 for share in identified.excitation)
+    if not (pull or heater):
+        return ()
+    judged = ((0, "pyrometer", heater), (1, "ring", True))
+    reasons = [] if identified.settled else ["the search has not settled"]
+    for sensor, name, estimated in judged:
+        seen = np.nanstd(identified.predicted.error[:, sensor]) > SEEN[sensor]
+        if estimated and seen and (size := coloured(identified.errors[:, sensor])) > COLOURED:
+            reasons.append(f"prediction errors of the {name} are coloured (correlation {size:.2f})")
+    if heater:
+        T_1, Q_H = np.nanmean(identified.log.T_1), np.mean(identified.log.Q_H)
+        if abs(puller.T_1_0.real - T_1) > T_1_OFF:
+            reasons.append(f"its T_1 is {puller.T_1_0.real:.0f} K where the log's mean is {T_1:.0f} K")
+        if abs(puller.Q_H_0.real / Q_H - 1.0) > Q_H_OFF:
+            reasons.append(f"it needs {puller.Q_H_0.real / KILO:.1f} kW where the log's mean is {Q_H / KILO:.1f} kW")
+    parameters = {e.name for e in identified.estimates} - set(Lags._fields)
+    ends = [f"{name} ({by:+.1f})" for name, by in away.items() if (abs(by) if name in parameters else by) > FAR]
+    if ends:
+        reasons.append(f"estimates stand at the ends of their priors [standard deviations]: {', '.join(ends)}")
+    noise, sensors = {e.name: e.value for e in identified.noise}, identified.start
+    ring = np.hypot(max(sensors.camera_noise or (0.0,)), max(sensors.ripple or (0.0,)))
+    for name, value, usual, unit, size in (
+        ("ring", noise["camera_sd"], ring, "mm", MM),
+        ("pyrometer", noise["pyrometer_sd"], max(sensors.pyrometer_noise or (0.0,)), "K", 1.0),
+    ):
+        if usual and value > NOISY * usual:
+            reasons.append(f"noise of the {name} is {value / size:.2g} {unit}, the file says {usual / size:.2g} {unit}")
+    try:
+        _ = identified.puller
+    except CzError as error:
+        reasons.append(f"its numbers are not plausible: {error}")
+    return tuple(reasons)
+
+
+def coloured(errors: Floats) -> float:
+    """Largest correlation of errors within LAGS rows [-], without their strongest line, which may be the rotation's.
+
+    Errors are NaN where nothing was read.
+    """
+    u = np.nan_to_num(errors - np.nanmean(errors))
+    spectrum = np.fft.rfft(u)
+    peak = int(np.abs(spectrum).argmax())
+    spectrum[max(peak - 1, 0) : peak + 2] = 0.0
+    u = np.fft.irfft(spectrum, len(u))
+    u -= u.mean()
+    return float(max(abs(u[lag:] @ u[:-lag]) for lag in range(1, ROWS_BACK + 1)) / (u @ u))
+
+
+# Maximum a posteriori of the filter's prediction errors: what a log tells of a puller, and what it does not.
+
+HEATER = ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b", "eps", "k_l")
+"""Parameters of the path from the heater."""
+PULL = ("sigma", "lam")
+"""Parameters of the path from the pull speed to the ring; ``lam`` stands for the product lam dT_0."""
+LAGS = Lags._fields
+"""Delays of the heater's path; a log tells their sum better than each."""
+SHORT, LAG_SD, DEAD_SD = 2.0, 1.5, 5.0
+"""Median of a lag that the start does not have [s], standard deviation of a lag's logarithm [-] and of the dead
+time [s]."""
+PRIOR_SD, NOISE_SD = 0.35, 1.0
+"""Standard deviation of the logarithm of a parameter, and of the strength of a noise [-]."""
+LAM_SD = 0.3
+"""Standard deviation of lam [-]; with the mean LAM about that of a uniform distribution."""
+WIDER = 1.3
+"""Factor on the standard deviations of the curvature, which is steeper at the maximum than around it; ``python -m
+studies.identify`` counts the intervals that hold the truth."""
+INFORMED = 0.5
+"""An informed parameter keeps less than this share of the prior's standard deviation [-]."""
+AT_REST = 8, 0.02
+"""The search ends where as many steps have gained less: a dead time of whole rows is a kink, where it cannot go on."""
+CAUTIOUS = {"pyrometer_sd": 20.0, "camera_sd": 4.0}
+"""Factors on the noise where the search begins, so that the filter of a wrong puller can follow the log."""
+
+
+class Estimate(NamedTuple):
+    """What a log says of one number, SI units; of ``lam``, the product lam dT_0 [K]."""
+
+    name: str
+    prior: float
+    value: float
+    low: float
+    """Lower end of the 95 % interval."""
+    high: float
+    left: float
+    """Share of the prior's standard deviation that is left [-]."""
+    excited: bool = True
+    """Whether its drive moved enough; without that it is not estimated."""
+    trusted: bool = True
+    """Whether the model fits the log; of a lag, whether they add up to more than half a row."""
+
+    @property
+    def informed(self) -> bool:
+        """Whether the log says enough for the value to be used."""
+        return self.trusted and self.left < INFORMED
+
+
+@dataclass(frozen=True)
+class Identified:
+    """The result of an identification."""
+
+    start: PullerFile
+    estimates: tuple[Estimate, ...]
+    """Estimates of the numbers in HEATER, LAGS and PULL."""
+    noise: tuple[Estimate, ...]
+    """Estimates of the numbers in :class:`Noise`."""
+    excitation: tuple[float, float]
+    """Moves of pull speed and heater that no reading explains, in multiples of what is needed [-]."""
+    errors: Floats
+    """Prediction errors of pyrometer and ring in their standard deviations, shape (rows, 2); NaN without a reading."""
+    predicted: Predicted
+    logs: tuple[Log, ...]
+    """The logs in the rows that were estimated from."""
+    settled: bool
+    """Whether the search has ended at a maximum."""
+    misfits: tuple[str, ...] = ()
+    """Why the model does not fit the log, in words; empty if it does."""
+
+    @property
+    def log(self) -> Log:
+        """The logs one after the other."""
+        return join(self.logs)
+
+    def series(self, meniscus: MeniscusModel = HURLE) -> list[tuple[Floats, Floats, Floats]]:
+        """Times [s], load on the melt [W] and fluctuation of the interface [K] of each log.
+
+        They are those that a smoother gives for :attr:`puller`, so that its crystal grows as the log's did.
+        """
+        lags = _lags_of(self.puller, False)
+        model = Model(Noise._fields, self.puller.parameters, meniscus, lags)
+        theta = np.array([np.log(each.value / each.prior) for each in self.noise])
+        states = [smooth(log, model, theta) for log in self.logs]
+        pairs = zip(self.logs, states, strict=True)
+        return [(log.time - log.time[0], each[:, LOAD], each[:, FAST] + each[:, SLOW]) for log, each in pairs]
+
+    @property
+    def puller(self) -> PullerFile:
+        """The start with the numbers that the log tells: parameters, lags, and the noise of camera and pyrometer.
+
+        ``lam`` is none of them: each crystal of a scenario draws its own. Where the model does not fit, the numbers are
+        what explains the log best all the same.
+        """
+        sure = {e.name: e.value for e in (*self.estimates, *self.noise) if e.left < INFORMED}
+        names = {"camera_sd": "camera_noise", "pyrometer_sd": "pyrometer_noise"}
+        ranges = {own: sure[name] for name, own in names.items() if name in sure}
+        ranges |= {e.name: max(e.value, 0.0) for e in self.estimates if e.name in LAGS and e.excited and self.delayed}
+        parameters = {name: value for name, value in sure.items() if name in Parameters._fields}
+        own: dict[str, Any] = {name: (value, value) for name, value in ranges.items()}
+        return replace(self.start, parameters=self.start.parameters._replace(**parameters), **own)
+
+    @property
+    def verdict(self) -> str:
+        """One line: whether the model fits the log, or why it does not."""
+        if self.misfits:
+            return f"THE MODEL DOES NOT FIT: {'; '.join(self.misfits)}"
+        moved = [drive for drive, share in zip(("pull speed", "heater"), self.excitation, strict=True) if share >= 1.0]
+        return f"the model fits the log; moves of their own: {', '.join(moved) or 'none, so the log tells nothing'}"
+
+    @property
+    def delayed(self) -> bool:
+        """Whether the heater's path has a delay that the model's equations do not have."""
+        return any(e.trusted for e in self.estimates if e.name in LAGS and e.excited)
+
+
+def identify(
+    log: Log | Sequence[Log],
+    start: PullerFile = DEFAULT,
+    prior_sd: Mapping[str, float] | None = None,
+    meniscus: MeniscusModel = HURLE,
+) -> Identified:
+    """Estimate what one or several logs tell of a puller; parameters of a path that is not excited are left alone.
+
+    ``start`` holds the prior's medians, ``prior_sd`` standard deviations of logarithms other than PRIOR_SD. Drives that
+    seem to act before they do are moved by a row: the log's row then holds what came after its readings.
+    """
+    logs = (log,) if isinstance(log, Log) else tuple(log)
+    sds = _prior_sds(prior_sd or {})
+    pull, heater = measure_excitation(logs, start)
+    free = (*((*HEATER, *LAGS) if heater >= 1.0 else ()), *(PULL if pull >= 1.0 else ()))
+    model = Model((*free, *Noise._fields), start.parameters, meniscus, _lags_of(start, heater >= 1.0))
+    sd, latency = np.array([sds[name] for name in model.names]), start.latency or 0.0
+    rows = [prepare(each, latency) for each in logs]
+    best = _maximise(rows, model, sd)
+    if "heater_lag" in free and (total := _delay(best, model))[0] + 2.0 * total[1] < 0.0:
+        logs = tuple(map(shift_drives, logs))
+        rows = [prepare(each, latency) for each in logs]
+        best = _maximise(rows, model, sd)
+
+    def estimate(name: str) -> Estimate:
+        usual = model.value(name, LAM if name == "lam" else 0.0)
+        if name not in model.names:
+            return Estimate(name, usual, usual, usual, usual, 1.0, excited=False)
+        j = model.names.index(name)
+        low, value, high = (model.value(name, best.theta[j] + sign * 1.96 * best.sd[j]) for sign in (-1.0, 0.0, 1.0))
+        delay = name not in LAGS or np.subtract(*(_delay(best, model) * (1.0, 2.0))) > 0.5 * logs[0].interval
+        return Estimate(name, usual, value, low, high, best.sd[j] / sd[j], trusted=bool(delay))
+
+    whole = join(rows)
+    read = np.isfinite([whole.T_1, whole.ring]).T
+    errors = np.where(read, best.out.error / np.sqrt(best.out.variance), np.nan)
+    told, noise = tuple(map(estimate, (*HEATER, *LAGS, *PULL))), tuple(map(estimate, Noise._fields))
+    result = Identified(start, told, noise, (pull, heater), errors, best.out, tuple(rows), best.settled)
+    away = dict(zip(model.names, (best.theta - model.mean) / sd, strict=True))
+    if reasons := misfits(result, model.puller(best.theta + 0j), away):
+        told, noise = (tuple(e._replace(trusted=False) for e in each) for each in (told, noise))
+    return replace(result, estimates=told, noise=noise, misfits=reasons)
+
+
+def _prior_sds(given: Mapping[str, float]) -> dict[str, float]:
+    sds = dict.fromkeys((*HEATER, *PULL), PRIOR_SD) | dict.fromkeys(Noise._fields, NOISE_SD) | {"lam": LAM_SD}
+    sds |= {"heater_lag": LAG_SD, "pyrometer_filter": LAG_SD, "heater_dead_time": DEAD_SD}
+    for name, value in given.items():
+        if name not in sds or not 0.0 < value < np.inf:
+            raise CzError(unknown("parameter", name, sds) if name not in sds else f"prior of {name}: {value!r}")
+        sds[name] = value
+    return sds
+
+
+def _lags_of(start: PullerFile, free: bool) -> Lags:
+    """The start's lags; where they are estimated, a short one in place of none."""
+    lag, dead, slow = (float(np.mean(getattr(start, name) or 0.0)) for name in LAGS)
+    return Lags(lag or SHORT * free, dead, slow or SHORT * free)
+
+
+class Maximum(NamedTuple):
+    """The posterior's maximum."""
+
+    theta: Floats
+    """Free numbers."""
+    covariance: Floats
+    """Covariance of the free numbers."""
+    out: Predicted
+    """The filter's output there."""
+    settled: bool
+
+    @property
+    def sd(self) -> Floats:
+        """Standard deviations of the free numbers."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def _delay(best: Maximum, model: Model) -> Floats:
+    """Sum of the lags and its standard deviation [s], shape (2,)."""
+    lags = model.delays(best.theta)
+    slopes = {"heater_lag": lags.heater_lag, "heater_dead_time": 1.0, "pyrometer_filter": lags.pyrometer_filter}
+    slope = np.array([slopes.get(name, 0.0) for name in model.names])
+    return np.array([sum(lags), np.sqrt(slope @ best.covariance @ slope)])
+
+
+def _maximise(logs: Sequence[Log], model: Model, sd: Floats) -> Maximum:
+    """The posterior's maximum, where the search ends or began if the filter cannot follow the log.
+
+    The curvature is Fisher's information of Gaussian prediction errors, so no second derivatives are needed.
+    """
+
+    @lru_cache(maxsize=2)
+    def posterior(packed: bytes) -> tuple[float, Floats, Floats, Predicted]:
+        away = np.frombuffer(packed)
+        parts = [sensitivities(log, model, model.mean + away * sd) for log in logs]
+        out = Predicted(*(np.concatenate(each) for each in zip(*(part[0] for part in parts), strict=True)))
+        E, S = (np.concatenate([part[k] for part in parts], axis=1) for k in (1, 2))
+        e, s = out.error, out.variance
+        if not (np.isfinite(E).all() and np.isfinite(S).all() and s.min() > 0.0):
+            return np.inf, np.zeros(len(away)), np.eye(len(away)), out
+        slope = np.sum(e * E / s + 0.5 * S / s * (1.0 - e * e / s), axis=(1, 2)) * sd + away
+        A, B = ((part.reshape(len(away), -1).T * sd).T for part in (E / np.sqrt(s), S / s))
+        value = 0.5 * float(np.sum(np.log(s) + e * e / s) + away @ away)
+        return value, slope, A @ A.T + 0.5 * B @ B.T + np.eye(len(away)), out
+
+    def part(index: int) -> Callable[[Floats], Any]:
+        return lambda x: posterior(x.tobytes())[index]
+
+    away, settled = _plausible_start(logs, model, sd), False
+    values = [posterior(away.tobytes())[0]]
+
+    def stop_at_rest(intermediate_result: Any) -> None:
+        values.append(float(intermediate_result.fun))
+        if len(values) > AT_REST[0] and values[-AT_REST[0]] - values[-1] < AT_REST[1]:
+            raise StopIteration
+
+    if np.isfinite(values[0]):
+        options: Any = {"gtol": 0.1, "maxiter": 100}
+        how: Any = {"jac": part(1), "hess": part(2), "method": "trust-exact", "callback": stop_at_rest}
+        away = minimize(part(0), away, options=options, **how).x
+        settled = len(values) <= options["maxiter"]
+    _, _, curvature, out = posterior(away.tobytes())
+    return Maximum(model.mean + away * sd, WIDER**2 * np.linalg.inv(curvature) * np.outer(sd, sd), out, settled)
+
+
+def _plausible_start(logs: Sequence[Log], model: Model, sd: Floats) -> Floats:
+    """A start in prior standard deviations: its operating point has the log's mean temperature and power, nearly."""
+    away = np.zeros(len(sd))
+    for name, factor in CAUTIOUS.items():
+        j = model.names.index(name)
+        away[j] = np.log(factor) / sd[j]
+    if "G_1a" not in model.names:
+        return away
+    T_1, Q_H = (np.nanmean(np.concatenate([getattr(log, name) for log in logs])) for name in ("T_1", "Q_H"))
+
+    def misfit(x: Floats) -> Floats:
+        p = model.puller(model.mean + x * sd)
+        return np.array([*(x - away), (p.T_1_0 - T_1) / 5.0, (p.Q_H_0 / Q_H - 1.0) / 0.02])
+
+    start: Floats = least_squares(misfit, away).x
+    return start

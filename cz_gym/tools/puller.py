@@ -1,0 +1,81 @@
+"""What a puller file implies: ``cz-gym puller FILE.toml``."""
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+
+from cz_gym.body.process import STATES, linearise, radius_model
+from cz_gym.physics.parameters import Parameters
+from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, make_puller
+from cz_gym.physics.quantities import MACHINE
+from cz_gym.puller.file import PullerFile, defaults_of, doubts, find_puller, value_of
+from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.units import CELSIUS, HOUR, KILO, MINUTE, MM, MM_PER_MIN
+
+
+def implied(puller: PullerFile) -> dict[str, str]:
+    """What follows from a puller's numbers at its operating point, as texts by headings."""
+    q, p, pull, power = puller.parameters, make_puller(puller.parameters), puller.pull_room, puller.power_range
+    model, chain = radius_model(p), [STATES.index(name) for name in ("T_1", "T_2", "T_b")]
+    lags = sorted(-1.0 / np.linalg.eigvals(linearise(p).A[np.ix_(chain, chain)]).real / MINUTE)
+    fastest = 2.0 * q.v_0 if math.isinf(pull) else q.v_0 + min(pull, q.v_0)
+    temperatures = zip(("heater T_1", "crucible T_2", "melt T_b"), p.state_0[2:], strict=True)
+    return {
+        "crystal": f"{2 * q.r_0 / MM:.4g} mm in diameter, {q.v_0 / MM_PER_MIN:.4g} mm/min, "
+        f"{q.rho_s * math.pi * q.r_0**2 * q.v_0 * HOUR:.3g} kg/h",
+        "heater power": f"{p.Q_H_0 / KILO:.4g} kW",
+        "temperatures": ", ".join(f"{name} {T:.0f} K ({T - CELSIUS:.0f} °C)" for name, T in temperatures),
+        "meniscus": f"{p.h_0 / MM:.3g} mm high, within {HEIGHT_MIN / MM:.3g} to {HEIGHT_MAX_IN_A * p.a / MM:.3g} mm",
+        "radius": f"poles {model.poles[0]:.3g} and {model.poles[1]:.3g} rad/s in Model I at a constant melt "
+        f"temperature; lost at {puller.radius_limit / MM:.3g} mm from the reference",
+        "left alone": ", ".join(f"Model {name} {_left_alone(q, mix)}" for name, mix in (("I", 1.0), ("II", 0.0))),
+        "bright ring": f"{p.ring_bias / MM:.3g} mm outside the crystal, zero at {model.zero:.3g} rad/s",
+        "hot zone": f"time constants {', '.join(f'{lag:.3g}' for lag in lags)} min",
+        "pull speed": f"{(2.0 * q.v_0 - fastest) / MM_PER_MIN:.4g} to {fastest / MM_PER_MIN:.4g} mm/min"
+        + _stated(puller, "pull_slew"),
+        "heater": f"{max(p.Q_H_0 - power, 0.0) / KILO:.4g} to {(p.Q_H_0 + power) / KILO:.4g} kW"
+        + _stated(puller, "heater_slew", "heater_step", "heater_lag", "heater_dead_time"),
+        "sensors": f"every {puller.control_interval:g} s"
+        + _stated(puller, "camera_noise", "pyrometer_noise", "latency", "pyrometer_filter"),
+    }
+
+
+def _left_alone(parameters: Parameters, mix: float) -> str:
+    """What a small error does without a controller, by the fastest pole of the plant with its melt."""
+    growth = np.linalg.eigvals(linearise(make_puller(parameters, mix)).A).real.max()
+    return f"grows to e times its size in {1.0 / growth / MINUTE:.3g} min" if growth > 0.0 else "dies out"
+
+
+def _stated(puller: PullerFile, *symbols: str) -> str:
+    """Numbers that the puller's file states, in the shown units."""
+    text = ""
+    for quantity in (MACHINE[symbol] for symbol in symbols):
+        value = value_of(puller, quantity)
+        if value is not None:
+            ends = dict.fromkeys(f"{end / quantity.size:g}" for end in np.atleast_1d(value))
+            text += f"; {quantity.symbol.replace('_', ' ')} {' to '.join(ends)} {quantity.shown}"
+    return text
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = OneLineParser("cz-gym puller", "Print what a puller file implies.")
+    parser.add_argument("puller", metavar="FILE.toml", help="puller file, or the name of a shipped one")
+    return parser.run(_main, arguments, "plant", "nothing printed")
+
+
+def _main(given: argparse.Namespace) -> None:
+    puller = find_puller(given.puller)
+    taken, sizes = defaults_of(puller), {each.key: each.size for each in MACHINE.values()}
+    lines = implied(puller) | {
+        "as the default": ", ".join(f"{key} = {value / sizes[key]:.10g}" for key, value in taken.items()),
+        "as the scenario": ", ".join(key for key in puller.missing if key not in taken),
+    }
+    print(f"puller {puller.label}")
+    for heading, text in lines.items():
+        print(f"{heading:<15} {text or 'nothing'}")
+    for doubt in doubts(puller):
+        print(doubt, file=sys.stderr)

@@ -1,0 +1,140 @@
+"""``cz-gym train``: train an agent by a recipe, or several training seeds side by side."""
+
+import argparse
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from cz_gym.agents.recipes import CRYSTAL, CRYSTAL_RECIPES, CZ, DEFAULT, FEW_UPDATES, RECIPES, Recipe
+from cz_gym.agents.train import read_settings
+from cz_gym.config import check_config
+from cz_gym.puller.file import chosen_puller
+from cz_gym.support.command_line import OneLineParser, between, guarded, interpreter
+from cz_gym.support.errors import CzError
+from cz_gym.support.files import check_writable, locked
+
+from .registry import make_controller
+
+
+def parse(argv: Sequence[str]) -> argparse.Namespace:
+    """Read the command line; exits with code 2 and one line if it is wrong."""
+    parser = OneLineParser(
+        prog="cz-gym train",
+        description="Train an agent by a recipe and choose it on validation episodes.",
+        epilog="The run folder holds the agent with its contract, settings, checkpoints, progress and logs.",
+    )
+    add = parser.add_argument
+    add("--algo", choices=RECIPES, help=f"recipe (default: {DEFAULT}, or the resumed run's)")
+    add("--env", choices=(CZ, CRYSTAL), help=f"environment (default: {CZ}, or the resumed run's)")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--seed", type=between(0, 2**63 - 1), help="training seed (default: 0, or the resumed run's)")
+    about = "training seeds side by side, a processor each; with --resume those that are not finished"
+    which.add_argument("--seeds", type=_seeds, metavar="FIRST-LAST", help=about)
+    about = "environment steps of learning (default: the recipe's, or the resumed run's)"
+    add("--steps", type=between(1, 10**12), help=about)
+    about = "what to train on: a scenario's name, all, FILE.py:NAME, or A=0.6,B=0.4 (default: as for --steps)"
+    add("--scenario", help=about)
+    parser.add_puller("train for it, at its control interval")
+    about = "run folder (default: runs/<algo>-seed<seed>; with --seeds runs/<algo>, with a folder for each seed)"
+    add("--out", type=Path, help=about)
+    parser.add_cluster()
+    add("--plot", action="store_true", help="draw the progress into the run folder: progress.png")
+    add("--resume", action="store_true", help="continue from the run folder's checkpoint; sac with a new replay buffer")
+    about = "time between checkpoints: the most that a crash loses (default: %(default)s)"
+    add("--checkpoint-seconds", type=between(0, 10**6), default=60, metavar="S", help=about)
+    arguments = parser.parse_args(argv)
+    if arguments.cluster and not arguments.seeds:
+        parser.error("--cluster shares --seeds FIRST-LAST between machines: a single seed is one task")
+    suffix = "" if arguments.seeds else f"-seed{arguments.seed or 0}"
+    puller = f"-{Path(arguments.puller).stem}" if arguments.puller else ""
+    crystal = "-crystal" if arguments.env == CRYSTAL else ""
+    arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT}{crystal}{puller}{suffix}"
+    return arguments
+
+
+def main(argv: Sequence[str]) -> int:
+    """Train; returns 0 when done, 2 for bad input, 130 when interrupted."""
+    arguments = parse(argv)
+    words = ["-m", "cz_gym", "train", *(word for word in argv if word != "--resume"), "--resume"]
+    left = f"{shlex.join([interpreter(), *words])} continues from the last checkpoint"
+    extras = "agents,benchmark" if arguments.plot else "agents"
+    return guarded("cz-gym train", lambda: train(arguments), extras, left)
+
+
+def train(arguments: argparse.Namespace) -> int:
+    """Run the training that the command line asks for."""
+    if arguments.plot:
+        import matplotlib  # noqa: F401  # if it is missing, say so before the training
+    from tqdm import tqdm
+
+    from cz_gym.agents.train import Job, train_seed, train_seeds
+    from cz_gym.agents.validation import references
+
+    folders = [arguments.out.resolve() / f"seed{seed}" for seed in arguments.seeds or ()] or [arguments.out]
+    recipe, seed = _recipe_and_seed(arguments, folders)
+    check_writable(arguments.out)
+    for folder in folders:
+        with locked(folder):
+            pass  # if another process has it, say so before the training
+    options = references(make_controller, recipe), arguments.checkpoint_seconds, arguments.plot
+    seeds = arguments.seeds or [seed]
+    jobs = [Job(folder, recipe, seed, *options) for folder, seed in zip(folders, seeds, strict=True)]
+    what = f"{len(jobs)} seeds" if arguments.seeds else f"seed {seed}, {recipe.steps:,} steps"
+    machine = f", puller {recipe.config.puller.label}" if recipe.puller else ""
+    if recipe.updates < FEW_UPDATES:
+        print(f"{recipe.steps:,} steps are {recipe.updates} updates of {recipe.name}: too few to learn from")
+    where = f"{recipe.environment} ({', '.join(recipe.stages)}), " if recipe.environment else ""
+    print(f"{recipe.name}, {what} on {where}{recipe.config.scenario.name}{machine}, into {arguments.out}")
+    if not arguments.seeds:
+        with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, disable=None) as bar:
+            summary = train_seed(jobs[0], bar)
+        print(f"{_summary_line(summary)}\nwrote {arguments.out / 'agent.onnx'}")
+        return 0
+    form = "{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+    with tqdm(total=len(jobs), bar_format=form, disable=None) as bar:
+        for job, summary in train_seeds(jobs, bar, arguments.cluster):
+            bar.write(f"seed {job.seed}: {_summary_line(summary)}")
+    print(f"wrote agent.onnx into {len(jobs)} folders of {arguments.out}")
+    return 0
+
+
+def _summary_line(summary: dict[str, float]) -> str:
+    ends = "_rmse_mm"
+    beside = {name.removesuffix(ends): value for name, value in summary.items() if name.endswith(ends)}
+    return (
+        f"best agent on {summary['validation_episodes']} validation episodes: mean RMSE "
+        f"{beside.pop('validation'):.3f} mm, {100 * summary['failure_rate']:.1f} % lost; beside it "
+        + ", ".join(f"{name} {value:.3f}" for name, value in beside.items())
+    )
+
+
+def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tuple[Recipe, int]:
+    """Recipe and training seed of the command line, or of the first resumed run; CzError if none may resume."""
+    begun = [folder for folder in folders if (folder / "settings.json").exists()]
+    if begun and not arguments.resume:
+        raise CzError(f"{begun[0]} holds a run already: --resume it, or name another --out")
+    saved = read_settings((begun or folders)[0] / "settings.json") if arguments.resume else {}
+    settings, agents = saved.get("settings", {}), saved.get("algorithm", DEFAULT)
+    recipes = CRYSTAL_RECIPES if (arguments.env or settings.get("environment")) == CRYSTAL else RECIPES
+    name = arguments.algo or {recipe.name: key for key, recipe in recipes.items()}.get(agents, agents)
+    if name not in recipes:
+        raise CzError(f"{name!r} is no recipe here: name one of {', '.join(recipes)} by --algo")
+    chosen = {
+        "steps": arguments.steps or saved.get("steps"),
+        "scenario": arguments.scenario or settings.get("scenario"),
+        "puller": arguments.puller or settings.get("puller"),
+    }
+    begun_with = {field: settings[field] for field in ("num_envs", "batch_size") if field in settings}
+    recipe = replace(recipes[name].with_steps(chosen.pop("steps") or recipes[name].steps), **begun_with)
+    recipe = replace(recipe, **{field: value for field, value in chosen.items() if value})
+    chosen_puller(recipe.puller or None)
+    check_config(recipe.config)
+    return recipe, saved.get("seed", 0) if arguments.seed is None else arguments.seed
+
+
+def _seeds(text: str) -> range:
+    first, _, last = text.partition("-")
+    if not (first.isdecimal() and last.isdecimal() and 0 <= int(last) - int(first) < 1000):
+        raise argparse.ArgumentTypeError(f"must be FIRST-LAST, at most 1000 seeds, not {text!r}")
+    return range(int(first), int(last) + 1)
