@@ -94,7 +94,7 @@ def test_versions_agree_and_core_dependencies_are_four():
     assert cz_gym.__version__ == PROJECT["version"]
     assert f"\nversion: {PROJECT['version']}\n" in (ROOT / "CITATION.cff").read_text()
     names = [requirement.partition(">")[0] for requirement in PROJECT["dependencies"]]
-    assert names == ["gymnasium", "numpy", "scipy", "numba"]
+    assert names == ["gymnasium", "numpy", "scipy", "numba", "llvmlite"]
 
 
 def required(extra):
