@@ -24,7 +24,7 @@ from cz_gym.physics.parameters import describe
 from tests.processes import ROOT, python
 
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "results" / "README.md", *sorted(DOCS.rglob("*.md"))]
 SLOW = {"docs/paper.md", "docs/extend/meniscus.md", "docs/your-puller.md", "docs/learn/libraries.md"}
 SMALL = {
     "num_envs=10_000": "num_envs=100",
@@ -162,6 +162,12 @@ def test_commands_of_the_pages_are_understood(understood):
     for words in listed:
         understood(words)
     assert len(listed) > 20
+
+
+def test_every_folder_of_results_is_listed_with_its_command():
+    rows = re.findall(r"^\| (`.*?) \|", (ROOT / "results" / "README.md").read_text(), re.MULTILINE)
+    listed = [name for row in rows for name in re.findall(r"`([\w-]+)`", row)]
+    assert listed == sorted(each.name for each in (ROOT / "results").iterdir() if each.is_dir() and each.name != "cache")
 
 
 @pytest.mark.slow
