@@ -17,7 +17,8 @@ language = "en"
 
 root_doc = "docs/index"
 include_patterns = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/**.md", "results/**.md"]
-exclude_patterns = [".*", "build", "dist", "runs", "results/cache", "docs/_*", "results/README.md", "**/.*", "**/node_modules"]
+exclude_patterns = [".*", "build", "dist", "runs", "results/cache", "results/README.md", "docs/_*", "**/.*"]
+exclude_patterns += ["**/node_modules"]
 extensions = ["myst_parser", "sphinx.ext.autodoc", "czdocs.mathml", "czdocs.tables", "czdocs.names"]
 nitpicky = True
 nitpick_ignore = [("py:func", "make_config")]
