@@ -11,7 +11,7 @@ from pathlib import Path
 
 from cz_gym.config import Config
 from cz_gym.crystal.process import ENVIRONMENTS
-from cz_gym.support.names import unknown
+from cz_gym.support.names import unknown_name_message
 
 from .contract import AgentFileError, Contract, read_agent
 from .policy import OnnxPolicy
@@ -50,7 +50,7 @@ def shipped_seeds(name: str = DEFAULT) -> list[Path]:
     paths = {int(path.stem.removeprefix(f"{name}-seed")): path for path in MODELS.glob(f"{name}-seed[0-9]*.onnx")}
     if not paths:
         known = [each for environment in ENVIRONMENTS for each in shipped_names(environment)]
-        raise AgentFileError(unknown("shipped agent", name, known))
+        raise AgentFileError(unknown_name_message("shipped agent", name, known))
     return [paths[seed] for seed in sorted(paths)]
 
 

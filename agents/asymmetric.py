@@ -25,7 +25,7 @@ from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.process import Channel
 from cz_gym.spaces import observations
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import needs
+from cz_gym.support.names import require_type
 
 GAINS = {
     "ring_error": 8.0, "integral": 4.0, "v_p": 8.0, "Q_H": 8.0, "r_c_error": 8.0, "h_c": 8.0, "T_b": 8.0, "dT_i": 2.0,
@@ -200,7 +200,7 @@ class LearnState(BaseCallback):
     seen: torch.Tensor | None = None
 
     def _init_callback(self) -> None:
-        policy: Any = needs(Asymmetric, self.model.policy, "LearnState fits the estimate of such a policy alone")
+        policy: Any = require_type(Asymmetric, self.model.policy, "LearnState fits the estimate of such a policy alone")
         on_policy = isinstance(policy, AsymmetricPolicy)
         self.estimator: StateEstimator = policy.pi_features_extractor if on_policy else policy.actor.features_extractor
         self.optimizer = torch.optim.Adam(self.estimator.estimate.parameters())

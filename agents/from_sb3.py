@@ -24,7 +24,7 @@ from cz_gym.evaluation.user_code import scenarios
 from cz_gym.spaces import observations
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.files import write_files
-from cz_gym.support.names import needs
+from cz_gym.support.names import require_type
 
 from .contract import AgentFileError, Contract, agent_files
 from .policy import OnnxPolicy
@@ -79,9 +79,9 @@ def save_agent(
     path = Path(path)
     if path.suffix != ".onnx":
         raise AgentFileError(f"{path}: an agent file ends in .onnx")
-    needs(BaseAlgorithm, model, "stable_baselines3.PPO.load(file) reads one")
+    require_type(BaseAlgorithm, model, "stable_baselines3.PPO.load(file) reads one")
     if normalisation is not None:
-        needs(VecNormalize, normalisation, "VecNormalize.load(file, env) reads one")
+        require_type(VecNormalize, normalisation, "VecNormalize.load(file, env) reads one")
     if config is not None:
         check_config(config)
     normalisation, config = normalisation or model.get_vec_normalize_env(), _config_of(model, config)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from cz_gym.config import Config, check_config
 from cz_gym.crystal.process import ENVIRONMENTS
-from cz_gym.spaces import ACTIONS, MadeFor, mark, observations
+from cz_gym.spaces import ACTIONS, TargetEnv, observations, tag
 from cz_gym.support.errors import CzError
 
 from .contract import AgentFileError, Contract, observation_hash, read_agent
@@ -91,10 +91,10 @@ class OnnxPolicy:
         return self.contract.action
 
     @property
-    def made_for(self) -> MadeFor:
+    def made_for(self) -> TargetEnv:
         """The environment it was trained in: meaning of its actions, control interval, plant and puller."""
         contract = self.contract
-        return MadeFor(self.action, contract.control_interval, contract.plant_hash, contract.puller)
+        return TargetEnv(self.action, contract.control_interval, contract.plant_hash, contract.puller)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -136,7 +136,7 @@ class OnnxPolicy:
         shapes = [(len(inputs["observation"]), width) for width in (2, self.remembers) if width]
         if [output.shape for output in outputs] != shapes or not all(np.isfinite(output).all() for output in outputs):
             raise AgentFileError(f"agent {self.contract.sha256[:12]}: its action is not two finite numbers")
-        outputs[0] = mark(outputs[0], self.made_for)
+        outputs[0] = tag(outputs[0], self.made_for)
         return outputs
 
 

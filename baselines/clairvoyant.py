@@ -17,7 +17,7 @@ from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, Disturbance, Puller, State, disturbance, make_puller, rk4
 from cz_gym.physics.schedule import bias_offset, reference
 from cz_gym.process import Inputs, scales
-from cz_gym.spaces import STATE, MadeFor, mark
+from cz_gym.spaces import STATE, TargetEnv, tag
 from cz_gym.support.errors import CzError
 from cz_gym.support.names import stack
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
@@ -376,7 +376,7 @@ class OptimalInputs:
     """Inputs at the operating point, shape (n, 2)."""
     ranges: Floats
     """What an action of 1 moves pull speed [m/s] and heater power [W] by."""
-    made_for: MadeFor
+    made_for: TargetEnv
 
     def predict(
         self, observation: Any, state: Memory | None = None, episode_start: Any = None, deterministic: bool = True
@@ -394,4 +394,4 @@ class OptimalInputs:
         deviation = np.concatenate([x - best.x[k, slot], memory.correction], axis=-1)
         correction = memory.correction + (best.feedback[k, slot] @ deviation[:, :, None])[:, :, 0]
         pull, power = ((best.u[k, slot] + correction - self.inputs_0) / self.ranges).T
-        return mark(to_action(pull, power, single), self.made_for), Memory(memory.step + 1.0, correction)
+        return tag(to_action(pull, power, single), self.made_for), Memory(memory.step + 1.0, correction)

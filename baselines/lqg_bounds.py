@@ -17,7 +17,7 @@ from scipy.linalg import solve_discrete_are
 from cz_gym.config import Config
 from cz_gym.physics.plant import hidden_load
 from cz_gym.process import scales
-from cz_gym.spaces import STATE, mark
+from cz_gym.spaces import STATE, tag
 
 from .clairvoyant import fluctuations_of, pullers_of
 from .lqg import LQG, Gains, LQGDesign, solve_each
@@ -116,7 +116,7 @@ class FullInformation(PrivilegedLQG):
         values = (array * scales(STATE, self.v_0, self.heater_range)).T
         seen: Any = SimpleNamespace(**dict(zip((channel.name for channel in STATE), values, strict=True)))
         pull, power, memory = self.step(seen, fresh(state, self.at_rest(seen), episode_start))
-        return mark(to_action(pull / self.v_0, power / self.heater_range, single), self.made_for), memory
+        return tag(to_action(pull / self.v_0, power / self.heater_range, single), self.made_for), memory
 
 
 @lru_cache(maxsize=16)

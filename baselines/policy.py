@@ -16,7 +16,7 @@ from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.process import Process
 from cz_gym.puller.file import DEFAULT, PullerFile
-from cz_gym.spaces import MadeFor, decode, mark, readable
+from cz_gym.spaces import TargetEnv, decode, readable, tag
 from cz_gym.support.errors import CzError
 from cz_gym.support.names import select
 
@@ -97,7 +97,7 @@ class MeasuredController(ABC):
         return True
 
     @cached_property
-    def made_for(self) -> MadeFor | None:
+    def made_for(self) -> TargetEnv | None:
         """The environment that takes its actions; None: every one does."""
         if self.any_environment:
             return None
@@ -147,7 +147,7 @@ class MeasuredController(ABC):
         given = read._replace(T_1=seen.T_1) if self.accepts_missing_temperature else read
         pull, power, memory = self.step(given, state.memory)
         action = to_action(pull / self.v_0, power / self.heater_range, single)
-        return mark(action, self.made_for), State(read, memory)
+        return tag(action, self.made_for), State(read, memory)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.puller.file import DEFAULT
 from cz_gym.support.errors import CzError
-from cz_gym.support.files import check_writable, naming, write_files
+from cz_gym.support.files import check_writable, name_file_in_errors, write_files
 
 from .lqg import STEP_TIME
 from .policy import Floats
@@ -176,7 +176,7 @@ class Search:
     def _read(self, path: Path) -> None:
         """Take up the trials of a file; CzError if it is none, or of another search."""
         try:
-            with naming(path):
+            with name_file_in_errors(path):
                 file = json.loads(path.read_text("utf-8"))
             parameters, puller = file["parameters"], file.get("puller", DEFAULT.label)
             crystals = file["scenario_hash"], file.get("control_interval_s", self.config.puller.control_interval)

@@ -23,10 +23,10 @@ from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.quantities import Range
 from cz_gym.puller.file import DEFAULT, PullerFile, find_puller
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import needs, unknown
+from cz_gym.support.names import require_type, unknown_name_message
 
 from .process import Inputs, Process
-from .spaces import ACTIONS, CAMERA, OBSERVATIONS, MadeFor
+from .spaces import ACTIONS, CAMERA, OBSERVATIONS, TargetEnv
 
 VERSION = 0
 """Version of the environment's contract; a change of it, or of physics, makes a Cz-v1."""
@@ -141,9 +141,9 @@ class Config:
         return _hash(*numbers, *carried)
 
     @property
-    def made_for(self) -> MadeFor:
+    def made_for(self) -> TargetEnv:
         """What controllers and agents of this environment are made for."""
-        return MadeFor(self.action, self.control_interval, self.plant_hash, self.puller.label)
+        return TargetEnv(self.action, self.control_interval, self.plant_hash, self.puller.label)
 
     @property
     def hash(self) -> str:
@@ -172,7 +172,7 @@ class Config:
 def check_config(config: Config) -> Config:
     """Return the config; raise CzError for anything else, such as the name of a scenario."""
     given = repr(config) if isinstance(config, str) else ""
-    checked: Config = needs(
+    checked: Config = require_type(
         Config, config, f"cz_gym.config.make_config({given}) makes one, env.unwrapped.config is one"
     )
     return checked
@@ -194,15 +194,15 @@ def make_config(
     stage: Any = None,
 ) -> Config:
     """Check the arguments of the environment; CzError names what was given and what is allowed."""
-    machine, process = find_puller(puller), needs(Process, process or BODY, "cz_gym.body.process.BODY is one")
+    machine, process = find_puller(puller), require_type(Process, process or BODY, "cz_gym.body.process.BODY is one")
     if puller is not None and parameters is not None:
         raise CzError(f"parameters are those of the puller {machine.name!r}: give one of both")
     drawn_from = adapt_scenario(machine, find_distribution(scenario))
     mix_of(model, drawn_from)
     if not isinstance(observation, str) or observation not in (*OBSERVATIONS, CAMERA):
-        raise CzError(unknown("observation", observation, [*OBSERVATIONS, CAMERA]))
+        raise CzError(unknown_name_message("observation", observation, [*OBSERVATIONS, CAMERA]))
     if action not in ACTIONS:
-        raise CzError(unknown("action", action, ACTIONS))
+        raise CzError(unknown_name_message("action", action, ACTIONS))
     if camera is not None and observation != CAMERA:
         raise CzError(f'a camera is of use with observation="camera" only, not with {observation!r}')
     interval = positive("control_interval", machine.control_interval if control_interval is None else control_interval)
@@ -226,10 +226,12 @@ def make_config(
 
 def _weights(given: Any, usual: Any) -> Any:
     """The usual weights with the given ones in their place."""
-    named = given._asdict() if hasattr(given, "_asdict") else dict(needs(Mapping, given, "weights={'pull': 0.1}"))
+    named = (
+        given._asdict() if hasattr(given, "_asdict") else dict(require_type(Mapping, given, "weights={'pull': 0.1}"))
+    )
     for name, weight in named.items():
         if name not in usual._fields:
-            raise CzError(unknown("weight", name, usual._fields))
+            raise CzError(unknown_name_message("weight", name, usual._fields))
         number = isinstance(weight, Real)
         if not number or not 0.0 <= weight < math.inf:
             raise CzError(f"the weight {name!r} must be a number of at least 0, not {weight!r}")

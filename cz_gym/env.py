@@ -29,11 +29,11 @@ from cz_gym.puller.file import PullerFile
 from cz_gym.rendering.canvas import Frame
 from cz_gym.rendering.view import FPS, declared_modes, make_view
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import known_keywords, unknown
+from cz_gym.support.names import check_keywords, unknown_name_message
 
 from .config import Config, check_config, make_config, positive_whole
 from .process import Process
-from .spaces import CAMERA, CLIP, MarkedAction, check_marked, observations
+from .spaces import CAMERA, CLIP, TaggedAction, check_tagged, observations
 
 Observation = npt.NDArray[Any]
 Action = npt.NDArray[np.float32]
@@ -68,7 +68,7 @@ def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OP
     given = dict(options or {})
     for key in given:
         if key not in allowed:
-            raise CzError(unknown("reset option", key, allowed))
+            raise CzError(unknown_name_message("reset option", key, allowed))
     if "scenario" in given and "state" in given:
         raise CzError("reset options 'scenario' and 'state' exclude each other: a state has its own episode")
     if "scenario" in given:
@@ -76,7 +76,7 @@ def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OP
     return given
 
 
-class Form:
+class EnvBase:
     """Base of the scalar and the batched environment: construction from a config, and pickling."""
 
     FACTS: tuple[str, ...] = ("_over", "_begun", "_named", "spec", "action_space", "observation_space")
@@ -115,7 +115,7 @@ class Form:
         """Restart the record of the picture; only the scalar form has one."""
 
 
-class CzEnv(Form, gym.Env[Observation, Action]):
+class CzEnv(EnvBase, gym.Env[Observation, Action]):
     """Czochralski growth of a silicon ingot: hold the true radius, seeing only the camera's bright ring.
 
     ## Action Space
@@ -164,7 +164,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
     """
 
     metadata: dict[str, Any] = {"render_modes": declared_modes(), "render_fps": FPS}  # noqa: RUF012  (Gymnasium's own)
-    FACTS = (*Form.FACTS, "_np_random", "_np_random_seed")
+    FACTS = (*EnvBase.FACTS, "_np_random", "_np_random_seed")
 
     def __init__(
         self,
@@ -186,7 +186,7 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         stage: Any = None,
         **others: Any,
     ) -> None:
-        known_keywords(others, type(self).__init__, CzEnv.__init__)
+        check_keywords(others, type(self).__init__, CzEnv.__init__)
         config = make_config(
             scenario,
             model,
@@ -259,8 +259,8 @@ class CzEnv(Form, gym.Env[Observation, Action]):
         """
         if self._over:
             raise ResetNeeded("the episode is over (or never began): call reset()")
-        if type(action) is MarkedAction:
-            check_marked(action, self._made_for)
+        if type(action) is TaggedAction:
+            check_tagged(action, self._made_for)
         self._action[0] = check_action(action)
         self._step()
         out = self._out
@@ -366,7 +366,7 @@ Array = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 
 
-class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
+class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
     """Many pullers at once in one compiled loop; slot i with seed s equals :class:`CzEnv` with seed s bit for bit.
 
     Arguments are those of :class:`CzEnv`, with ``num_envs``, ``autoreset_mode`` (a
@@ -376,7 +376,7 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
     """
 
     metadata: dict[str, Any] = CzEnv.metadata | {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
-    FACTS = (*Form.FACTS, "_randoms", "_seeds", "_waiting")
+    FACTS = (*EnvBase.FACTS, "_randoms", "_seeds", "_waiting")
 
     def __init__(
         self,
@@ -389,7 +389,7 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
-        known_keywords(settings, make_config, CzVectorEnv.__init__)
+        check_keywords(settings, make_config, CzVectorEnv.__init__)
         config = make_config(scenario, **settings)
         if render_mode is not None:
             raise CzError(f"a batch does not render: render_mode must be None, not {render_mode!r}")
@@ -460,8 +460,8 @@ class CzVectorEnv(Form, VectorEnv[Array, Array, Array]):
         Raises InvalidAction for NaN, another shape, and an action made for another environment (:mod:`cz_gym.spaces`);
         ResetNeeded before the first reset and, with autoreset disabled, while any episode is over.
         """
-        if type(actions) is MarkedAction:
-            check_marked(actions, self._made_for)
+        if type(actions) is TaggedAction:
+            check_tagged(actions, self._made_for)
         actions = self._check_actions(actions)
         if not self._begun:
             raise ResetNeeded("call reset() first")

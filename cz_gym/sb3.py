@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_w
 
 from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import needs, unknown
+from cz_gym.support.names import require_type, unknown_name_message
 
 from .env import CzVectorEnv, EnvState
 from .spaces import observations
@@ -34,7 +34,7 @@ def make_vec_env(
     at every step.
     """
     if env not in ENVIRONMENTS:
-        raise CzError(unknown("environment", env, ENVIRONMENTS))
+        raise CzError(unknown_name_message("environment", env, ENVIRONMENTS))
     settings = {"process": ENVIRONMENTS[env]} | settings | ({"info": "all"} if critic_state else {})
     batch = CzVectorEnv(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
     slots = CzVecEnv(batch, stagger, critic_state)
@@ -54,7 +54,7 @@ class CzVecEnv(VecEnv):
     """
 
     def __init__(self, env: CzVectorEnv, stagger: int | None = None, critic_state: bool = False) -> None:
-        needs(CzVectorEnv, env, "without wrappers of gymnasium around it")
+        require_type(CzVectorEnv, env, "without wrappers of gymnasium around it")
         if env.autoreset_mode != AutoresetMode.SAME_STEP:
             raise CzError("CzVecEnv needs autoreset_mode=AutoresetMode.SAME_STEP, as stable-baselines3 resets itself")
         self.env = env

@@ -1,4 +1,4 @@
-"""Actions: how they move the drives, and marked ones that every environment but their own refuses."""
+"""Actions: how they move the drives, and tagged ones that every environment but their own refuses."""
 
 import math
 from functools import cache
@@ -72,7 +72,7 @@ def drives_of(
     return Drives(keep, SMOOTH_PULL * share, SMOOTH_HEATER * share, speed, heater_range)
 
 
-class MadeFor(NamedTuple):
+class TargetEnv(NamedTuple):
     """The environment that a controller or an agent was made for."""
 
     action: str
@@ -89,10 +89,10 @@ class MadeFor(NamedTuple):
         return f"action={self.action!r}, control_interval={self.control_interval:g}, plant {self.plant}{puller}"
 
 
-class MarkedAction(np.ndarray[Any, np.dtype[Any]]):
+class TaggedAction(np.ndarray[Any, np.dtype[Any]]):
     """An action, or one a row, that carries what it was made for; whatever is computed from it is a plain array."""
 
-    made_for: MadeFor | None
+    made_for: TargetEnv | None
 
     def __array_finalize__(self, other: Any) -> None:
         self.made_for = getattr(other, "made_for", None)
@@ -101,22 +101,22 @@ class MarkedAction(np.ndarray[Any, np.dtype[Any]]):
         return np.asarray(array)[()]
 
 
-def mark(action: npt.NDArray[Any], made_for: MadeFor | None) -> npt.NDArray[Any]:
+def tag(action: npt.NDArray[Any], made_for: TargetEnv | None) -> npt.NDArray[Any]:
     """The same action, refused by every environment but the one it was made for; with None, taken by every one."""
     if made_for is None:
         return action
-    marked = action.view(MarkedAction)
-    marked.made_for = made_for
-    return marked
+    tagged = action.view(TaggedAction)
+    tagged.made_for = made_for
+    return tagged
 
 
-def check_marked(action: MarkedAction, own: MadeFor) -> None:
+def check_tagged(action: TaggedAction, own: TargetEnv) -> None:
     """Raise InvalidAction for an action that was made for another environment than ``own``."""
     if message := mismatch(action.made_for, own):
         raise InvalidAction(f"{message} (np.asarray(action) is taken all the same)")
 
 
-def mismatch(made_for: MadeFor | None, own: MadeFor) -> str:
+def mismatch(made_for: TargetEnv | None, own: TargetEnv) -> str:
     """Differences between an environment and the one that a controller was made for; empty if there are none."""
     if made_for is None or made_for == own:
         return ""

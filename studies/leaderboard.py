@@ -28,7 +28,7 @@ from cz_gym.evaluation.protocol import (
 from cz_gym.evaluation.results import Result
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import CzError
-from cz_gym.support.files import check_writable, naming, write_files
+from cz_gym.support.files import check_writable, name_file_in_errors, write_files
 from cz_gym.tools.files import read_results, to_json
 from cz_gym.tools.registry import CONTROLLERS
 from cz_gym.tools.report.markdown import summary
@@ -114,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> None:
     check_writable(given.out)
-    with naming(given.folder):
+    with name_file_in_errors(given.folder):
         submitted = [submission(each) for each in sorted(given.folder.iterdir()) if each.is_dir()]
     if not submitted:
         raise CzError(f"{given.folder}: no submissions: each is a folder with agent files and benchmark.json")

@@ -21,7 +21,7 @@ from cz_gym.config import make_config
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import write_files
-from cz_gym.support.names import unknown
+from cz_gym.support.names import unknown_name_message
 from cz_gym.tools.registry import make_controller
 from cz_gym.tools.report.tables import markdown
 
@@ -141,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(given: argparse.Namespace) -> None:
     for name in given.learners:
         if name not in LEARNERS:
-            raise CzError(unknown("learner", name, LEARNERS))
+            raise CzError(unknown_name_message("learner", name, LEARNERS))
     runs, table = given.out / "runs.csv", given.out / "table.md"
     rows = list(csv.reader(runs.read_text().splitlines()))[1:] if runs.exists() else []
     known = {each.words for each in LEARNERS.values()}

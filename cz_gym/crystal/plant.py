@@ -10,10 +10,10 @@ import numpy as np
 from cz_gym.episodes.draw import randomised
 from cz_gym.jit import force_inlined, jittable, joined, labelled
 from cz_gym.physics.numerics import clip
-from cz_gym.physics.parameters import Parameters, Recipe, check_numbers, check_parameters
+from cz_gym.physics.parameters import CrystalRecipe, Parameters, check_numbers, check_parameters
 from cz_gym.physics.plant import Puller, derive_puller, heating, interface
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown
+from cz_gym.support.names import unknown_name_message
 from cz_gym.support.units import MM
 
 STAGES = ("crown", "body", "tail", "whole")
@@ -23,11 +23,11 @@ APART = (*STAGES, "begins", "heater_max")
 DRAWN = -1.0
 """Value of ``begins`` where each stage begins at its own length."""
 CrystalParameters: Any = NamedTuple(  # type: ignore[misc]
-    "CrystalParameters", [(name, float) for name in (*Parameters._fields, *Recipe._fields, *APART)]
+    "CrystalParameters", [(name, float) for name in (*Parameters._fields, *CrystalRecipe._fields, *APART)]
 )
-"""A puller's :class:`~cz_gym.physics.parameters.Parameters`, its :class:`~cz_gym.physics.parameters.Recipe`, the share
-of episodes [-] that grow each of the :data:`STAGES`, the length [m] at which they begin, or :data:`DRAWN`, and the
-heater's largest power [W]."""
+"""A puller's :class:`~cz_gym.physics.parameters.Parameters`, its :class:`~cz_gym.physics.parameters.CrystalRecipe`, the
+share of episodes [-] that grow each of the :data:`STAGES`, the length [m] at which they begin, or :data:`DRAWN`, and
+the heater's largest power [W]."""
 
 
 def complete(parameters: Any, machine: Any, stage: Any = None) -> Any:
@@ -72,7 +72,7 @@ def _shares(stage: Any, q: Any) -> dict[str, float]:
         )
     for name, share in shares.items():
         if name not in STAGES:
-            raise CzError(unknown("stage", name, STAGES, ", or a length in metres"))
+            raise CzError(unknown_name_message("stage", name, STAGES, ", or a length in metres"))
         if not (isinstance(share, Real) and not isinstance(share, bool) and 0.0 < share < math.inf):  # type: ignore[operator]
             raise CzError(f"the share of stage {name!r} must be a positive number, not {share!r}")
     total = math.fsum(map(float, shares.values()))
@@ -87,9 +87,9 @@ def named(text: str) -> Any:
         return text
 
 
-def parts(q: Any) -> tuple[Parameters, Recipe]:
+def parts(q: Any) -> tuple[Parameters, CrystalRecipe]:
     """The puller's and the recipe's numbers in the parameters."""
-    return labelled(Parameters, q), labelled(Recipe, q)
+    return labelled(Parameters, q), labelled(CrystalRecipe, q)
 
 
 # The plant of a whole crystal: the body's equations, with heat into the crystal, melt and level that change.

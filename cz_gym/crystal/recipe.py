@@ -1,7 +1,7 @@
 """The shape of a crystal and its growth rate against the length L [m] grown since the crown began.
 
-``p`` holds the numbers of a :class:`cz_gym.physics.parameters.Recipe`, ``e`` the episode's change of the reference,
-whose start and duration are lengths [m] here. All functions take complex lengths, for derivatives.
+``p`` holds the numbers of a :class:`cz_gym.physics.parameters.CrystalRecipe`, ``e`` the episode's change of the
+reference, whose start and duration are lengths [m] here. All functions take complex lengths, for derivatives.
 """
 
 import math

@@ -22,7 +22,7 @@ from cz_gym.jit import column, compiled_as, hashed, jittable, kernel, labelled, 
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.numerics import along, plus_product, rk4
 from cz_gym.process import LOST, Inputs, Process, Readings, Seen
-from cz_gym.spaces import MarkedAction, check_marked
+from cz_gym.spaces import TaggedAction, check_tagged
 from cz_gym.support.errors import CzError
 
 from .batch import Batch, first_key
@@ -445,8 +445,8 @@ class DifferentiableBatch:
         InvalidAction for NaN, another shape, and actions made for another environment;
         ResetNeeded before every slot had its first reset.
         """
-        if type(actions) is MarkedAction:
-            check_marked(actions, self._made_for)
+        if type(actions) is TaggedAction:
+            check_tagged(actions, self._made_for)
         if not self._begun.all():
             raise ResetNeeded("every slot needs a crystal: call reset()")
         before, n = self._state, self.num_envs

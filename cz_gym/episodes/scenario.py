@@ -39,7 +39,7 @@ _SHARE = "%", 0.0, 100.0
 _SPREAD = "%", 0.0, 49.9
 
 
-class Draw(Enum):
+class Variation(Enum):
     """When a member of a scenario makes its episodes differ from each other."""
 
     NEVER = "never"
@@ -53,22 +53,22 @@ class Draw(Enum):
 
     def differs(self, value: Any) -> bool:
         """Whether a member of this kind and value makes episodes differ."""
-        if self is Draw.RANGE:
+        if self is Variation.RANGE:
             return bool(value[0] != value[1])
-        if self is Draw.CHANCE:
+        if self is Variation.CHANCE:
             return bool(0.0 < value < 1.0)
-        return self is Draw.NONZERO and bool(np.any(value))
+        return self is Variation.NONZERO and bool(np.any(value))
 
 
 class Member(NamedTuple):
     """Metadata of a scenario's number, under the key ``member`` of its field."""
 
-    draw: Draw
+    draw: Variation
     quantity: Quantity
     """Its unit, meaning and range; the default may lie outside of the range."""
 
 
-def member(default: Any, draw: Draw, limits: tuple[str, float, float], meaning: str, later: bool = False) -> Any:
+def member(default: Any, draw: Variation, limits: tuple[str, float, float], meaning: str, later: bool = False) -> Any:
     """A number of a scenario, with its shown unit and its least and largest plausible value in it."""
     unit, low, high = limits
     return field(
@@ -76,7 +76,7 @@ def member(default: Any, draw: Draw, limits: tuple[str, float, float], meaning: 
     )
 
 
-def machine(symbol: str, default: Any, draw: Draw) -> Any:
+def machine(symbol: str, default: Any, draw: Variation) -> Any:
     """A number of a scenario that belongs to the machine: a puller file may state it."""
     return field(default=default, metadata={"member": Member(draw, MACHINE[symbol])})
 
@@ -85,23 +85,23 @@ def machine(symbol: str, default: Any, draw: Draw) -> Any:
 class Pullers:
     """Spread of the pullers: factors on their design parameters, uniform in 1 +- spread, and the mix of models."""
 
-    mix: Range = member(ONE, Draw.RANGE, ("1", 0.0, 1.0), "share of conduction lambda")
-    capillary: float = member(0.0, Draw.NONZERO, _SPREAD, "spread of the capillary constant a")
-    conductivity: float = member(0.0, Draw.NONZERO, _SPREAD, "spread of k_l")
+    mix: Range = member(ONE, Variation.RANGE, ("1", 0.0, 1.0), "share of conduction lambda")
+    capillary: float = member(0.0, Variation.NONZERO, _SPREAD, "spread of the capillary constant a")
+    conductivity: float = member(0.0, Variation.NONZERO, _SPREAD, "spread of k_l")
     conductance: float = member(
-        0.0, Draw.NONZERO, _SPREAD, "spread of kappa_12, G_1a, G_2b and kappa_b, each on its own"
+        0.0, Variation.NONZERO, _SPREAD, "spread of kappa_12, G_1a, G_2b and kappa_b, each on its own"
     )
-    start_radius_sd: float = member(0.0, Draw.NONZERO, _LENGTH, "standard deviation of r_c(0) - r_0")
+    start_radius_sd: float = member(0.0, Variation.NONZERO, _LENGTH, "standard deviation of r_c(0) - r_0")
     melt_loss: float = member(
-        0.0, Draw.NEVER, ("%", 0.0, 99.9), "share of the melt's heat capacity lost, linearly over 3 h, then held"
+        0.0, Variation.NEVER, ("%", 0.0, 99.9), "share of the melt's heat capacity lost, linearly over 3 h, then held"
     )
     capacity_factor: Range = member(
-        ONE, Draw.RANGE, _FACTOR, "log-uniform factor on C_1 and C_2, each on its own", later=True
+        ONE, Variation.RANGE, _FACTOR, "log-uniform factor on C_1 and C_2, each on its own", later=True
     )
-    melt_capacity_factor: Range = member(ONE, Draw.RANGE, _FACTOR, "log-uniform factor on C_b", later=True)
+    melt_capacity_factor: Range = member(ONE, Variation.RANGE, _FACTOR, "log-uniform factor on C_b", later=True)
     conductance_factor: Range = member(
         ONE,
-        Draw.RANGE,
+        Variation.RANGE,
         _FACTOR,
         "log-uniform factor on kappa_12, G_1a, G_2b and kappa_b, each on its own, beside their uniform one",
         later=True,
@@ -112,55 +112,55 @@ class Pullers:
 class Recipe:
     """Error e(t) of the temperature recipe: a linear ramp, then constant."""
 
-    rate: Range = member(NONE, Draw.RANGE, _RATE, "rate of T_1,ref")
-    duration: Range = member(NONE, Draw.RANGE, _SECONDS, "duration of the ramp")
-    start: Range = member(NONE, Draw.RANGE, _SECONDS, "start of the ramp")
+    rate: Range = member(NONE, Variation.RANGE, _RATE, "rate of T_1,ref")
+    duration: Range = member(NONE, Variation.RANGE, _SECONDS, "duration of the ramp")
+    start: Range = member(NONE, Variation.RANGE, _SECONDS, "start of the ramp")
 
 
 @dataclass(frozen=True)
 class Drift:
     """Drift p(t) of the hot zone, hidden in the melt's heat load and followed by a perfect recipe."""
 
-    amount: Range = member(NONE, Draw.RANGE, ("K", -500.0, 500.0), "final drift")
-    duration: Range = member(NONE, Draw.RANGE, _SECONDS, "duration of the ramp")
-    start: Range = member(NONE, Draw.RANGE, _SECONDS, "start of the ramp")
-    rate: float = member(0.0, Draw.NEVER, _RATE, "steady rate on top, from t = 0 on")
+    amount: Range = member(NONE, Variation.RANGE, ("K", -500.0, 500.0), "final drift")
+    duration: Range = member(NONE, Variation.RANGE, _SECONDS, "duration of the ramp")
+    start: Range = member(NONE, Variation.RANGE, _SECONDS, "start of the ramp")
+    rate: float = member(0.0, Variation.NEVER, _RATE, "steady rate on top, from t = 0 on")
 
 
 @dataclass(frozen=True)
 class Interface:
     """Fluctuation dT_i of the interface temperature: two stationary Ornstein-Uhlenbeck processes."""
 
-    sd: Range = machine("fluctuation_sd", NONE, Draw.NONZERO)
-    tau_fast: float = machine("tau_fast", 30.0, Draw.NEVER)
-    tau_slow: float = machine("tau_slow", 780.0, Draw.NEVER)
+    sd: Range = machine("fluctuation_sd", NONE, Variation.NONZERO)
+    tau_fast: float = machine("tau_fast", 30.0, Variation.NEVER)
+    tau_slow: float = machine("tau_slow", 780.0, Variation.NEVER)
 
 
 @dataclass(frozen=True)
 class Reference:
     """Change of the radius reference along the quintic 10 s^3 - 15 s^4 + 6 s^5."""
 
-    probability: float = member(0.0, Draw.CHANCE, _SHARE, "share of episodes with a change")
-    amount: Range = member(NONE, Draw.RANGE, _CHANGE, "change of the reference")
-    duration: Range = member(NONE, Draw.RANGE, _SECONDS, "duration of the change")
-    start: Range = member(NONE, Draw.RANGE, _SECONDS, "start of the change")
+    probability: float = member(0.0, Variation.CHANCE, _SHARE, "share of episodes with a change")
+    amount: Range = member(NONE, Variation.RANGE, _CHANGE, "change of the reference")
+    duration: Range = member(NONE, Variation.RANGE, _SECONDS, "duration of the change")
+    start: Range = member(NONE, Variation.RANGE, _SECONDS, "start of the change")
 
 
 @dataclass(frozen=True)
 class Sensor:
     """Camera and pyrometer."""
 
-    camera_noise: Range = machine("camera_noise", NONE, Draw.NONZERO)
-    pyrometer_noise: Range = machine("pyrometer_noise", NONE, Draw.NONZERO)
-    pyrometer_drift: Range = machine("pyrometer_drift", NONE, Draw.RANGE)
-    bias_offset: Range = machine("bias_offset", NONE, Draw.RANGE)
-    level_offset: Range = machine("level_offset", NONE, Draw.RANGE)
-    ripple: Range = machine("ripple", NONE, Draw.NONZERO)
-    rotation: Range = machine("rotation", NONE, Draw.RANGE)
-    latency: float = machine("latency", 0.0, Draw.NEVER)
-    outlier_probability: float = machine("outlier_probability", 0.0, Draw.NONZERO)
-    outlier_sd: float = machine("outlier_sd", 0.0, Draw.NEVER)
-    pyrometer_filter: Range = machine("pyrometer_filter", NONE, Draw.RANGE)
+    camera_noise: Range = machine("camera_noise", NONE, Variation.NONZERO)
+    pyrometer_noise: Range = machine("pyrometer_noise", NONE, Variation.NONZERO)
+    pyrometer_drift: Range = machine("pyrometer_drift", NONE, Variation.RANGE)
+    bias_offset: Range = machine("bias_offset", NONE, Variation.RANGE)
+    level_offset: Range = machine("level_offset", NONE, Variation.RANGE)
+    ripple: Range = machine("ripple", NONE, Variation.NONZERO)
+    rotation: Range = machine("rotation", NONE, Variation.RANGE)
+    latency: float = machine("latency", 0.0, Variation.NEVER)
+    outlier_probability: float = machine("outlier_probability", 0.0, Variation.NONZERO)
+    outlier_sd: float = machine("outlier_sd", 0.0, Variation.NEVER)
+    pyrometer_filter: Range = machine("pyrometer_filter", NONE, Variation.RANGE)
 
 
 @dataclass(frozen=True)
@@ -168,26 +168,31 @@ class Faults:
     """Faults of the camera: freezes show the last value; starts are uniform over 3 h, freezes disjoint."""
 
     flagged: tuple[int, int] = member(
-        (0, 0), Draw.NONZERO, ("1", 0, MAX_FLAGGED), "least and largest number of freezes with valid = 0; at most 3"
+        (0, 0),
+        Variation.NONZERO,
+        ("1", 0, MAX_FLAGGED),
+        "least and largest number of freezes with valid = 0; at most 3",
     )
-    flagged_duration: Range = member(NONE, Draw.RANGE, _SECONDS, "duration of each flagged freeze")
-    unflagged: int = member(0, Draw.NONZERO, ("1", 0, MAX_UNFLAGGED), "number of freezes with valid = 1; at most 1")
-    unflagged_duration: Range = member(NONE, Draw.RANGE, _SECONDS, "duration of the unflagged freeze")
-    dropout: Range = member(NONE, Draw.NONZERO, _SHARE, "probability of a sample with valid = 0")
-    bias_drift: Range = member(NONE, Draw.NONZERO, _CHANGE, "final unflagged drift of the ring")
-    bias_drift_duration: Range = member(NONE, Draw.RANGE, _SECONDS, "duration of the ring's drift")
+    flagged_duration: Range = member(NONE, Variation.RANGE, _SECONDS, "duration of each flagged freeze")
+    unflagged: int = member(
+        0, Variation.NONZERO, ("1", 0, MAX_UNFLAGGED), "number of freezes with valid = 1; at most 1"
+    )
+    unflagged_duration: Range = member(NONE, Variation.RANGE, _SECONDS, "duration of the unflagged freeze")
+    dropout: Range = member(NONE, Variation.NONZERO, _SHARE, "probability of a sample with valid = 0")
+    bias_drift: Range = member(NONE, Variation.NONZERO, _CHANGE, "final unflagged drift of the ring")
+    bias_drift_duration: Range = member(NONE, Variation.RANGE, _SECONDS, "duration of the ring's drift")
 
 
 @dataclass(frozen=True)
 class Actuators:
     """Limits of the drives beyond the action box; infinite or zero where there are none."""
 
-    pull_window: float = machine("pull_window", math.inf, Draw.NEVER)
-    pull_slew: float = machine("pull_slew", math.inf, Draw.NEVER)
-    heater_slew: float = machine("heater_slew", math.inf, Draw.NEVER)
-    heater_step: float = machine("heater_step", 0.0, Draw.NEVER)
-    heater_lag: Range = machine("heater_lag", NONE, Draw.RANGE)
-    heater_dead_time: Range = machine("heater_dead_time", NONE, Draw.RANGE)
+    pull_window: float = machine("pull_window", math.inf, Variation.NEVER)
+    pull_slew: float = machine("pull_slew", math.inf, Variation.NEVER)
+    heater_slew: float = machine("heater_slew", math.inf, Variation.NEVER)
+    heater_step: float = machine("heater_step", 0.0, Variation.NEVER)
+    heater_lag: Range = machine("heater_lag", NONE, Variation.RANGE)
+    heater_dead_time: Range = machine("heater_dead_time", NONE, Variation.RANGE)
 
 
 @dataclass(frozen=True)
@@ -253,7 +258,7 @@ class Scenario:
 
     @property
     def deterministic(self) -> bool:
-        """Whether all its episodes are the same: no member makes them differ (``Draw`` at each member)."""
+        """Whether all its episodes are the same: no member makes them differ (:class:`Variation`)."""
         return not any(each.metadata["member"].draw.differs(value) for _, each, value in self.members)
 
 

@@ -6,7 +6,7 @@ from numbers import Real
 from pathlib import Path
 
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown
+from cz_gym.support.names import unknown_name_message
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from .scenario import (
@@ -179,7 +179,7 @@ def find_scenario(scenario: AnyScenario) -> Scenario:
     if name in SCENARIOS and row in _ROWS:
         raise CzError(f"{scenario!r} is a row of the benchmark: the scenario is {name!r}, with {_ROWS[row]}")
     also = "" if isinstance(scenario, str) else ", or pass a cz_gym.Scenario, or a dict of scenarios and their shares"
-    raise CzError(unknown("scenario", scenario, [*SCENARIOS, *ALIASES, "all"], also))
+    raise CzError(unknown_name_message("scenario", scenario, [*SCENARIOS, *ALIASES, "all"], also))
 
 
 def mix_of(model: str | float | None, distribution: Distribution) -> tuple[float, float]:

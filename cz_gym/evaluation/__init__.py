@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cz_gym.support.files import write_files
-from cz_gym.support.names import needs
+from cz_gym.support.names import require_type
 from cz_gym.support.units import MM
 
 from .rollout import Rollout
@@ -26,7 +26,7 @@ def plot(run: Rollout, episode: int = 0, path: str | Path | None = None) -> Figu
     """
     from .plots import COLOURS, DrawnCrystal, draw, png
 
-    needs(Rollout, run, "cz_gym.evaluation.rollout.rollout(policy, config, seeds) makes one")
+    require_type(Rollout, run, "cz_gym.evaluation.rollout.rollout(policy, config, seeds) makes one")
     if not -len(run.seeds) <= episode < len(run.seeds):
         raise IndexError(f"episode must be below {len(run.seeds)}, not {episode}")
     signals, dt = run.episode(episode), run.config.control_interval

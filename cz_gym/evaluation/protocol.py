@@ -18,7 +18,7 @@ from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.process import Process
 from cz_gym.puller.file import DEFAULT, PullerFile
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown
+from cz_gym.support.names import unknown_name_message
 from cz_gym.support.units import MM, MM_PER_MIN
 
 REWARD, STATE, PLANT = "reward", "state", "plant"
@@ -268,7 +268,7 @@ def find_case(name: str, cases: Sequence[Case] = CASES) -> Case:
     for case in cases:
         if case.name == ALIASES.get(name, name):
             return case
-    raise CzError(unknown("scenario", name, [case.name for case in cases]))
+    raise CzError(unknown_name_message("scenario", name, [case.name for case in cases]))
 
 
 def contract_hash(cases: Sequence[Case]) -> str:

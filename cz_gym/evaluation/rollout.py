@@ -85,7 +85,7 @@ def rollout(
             before = time.perf_counter()
             action, memory = call_policy(policy, observation, memory, begins)
             seconds += time.perf_counter() - before
-            # An action may be marked with what it was made for; check_policy has said what fits.
+            # An action may be tagged with what it was made for; check_policy has said what fits.
             try:
                 observation, gained, terminated, truncated, info = env.step(np.asarray(action))
             except InvalidAction as error:

@@ -12,7 +12,7 @@ from cz_gym.config import Config
 from cz_gym.episodes.scenario import Distribution, Scenario
 from cz_gym.episodes.scenarios import SCENARIOS, find_distribution, find_scenario
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown
+from cz_gym.support.names import unknown_name_message
 
 from .protocol import Case, Contender
 
@@ -35,7 +35,7 @@ def load(place: str, kind: str, fits: Callable[[Any, str], bool]) -> tuple[str, 
     spec.loader.exec_module(module)
     if not hasattr(module, name):
         offered = [each for each, value in vars(module).items() if each[0] != "_" and fits(value, module_name)]
-        raise CzError(f"{path}: {unknown(kind, name, offered)}")
+        raise CzError(f"{path}: {unknown_name_message(kind, name, offered)}")
     return name, getattr(module, name)
 
 

@@ -46,7 +46,7 @@ class Parameters(NamedTuple):
     T_e: float = 1300.0
 
 
-class Recipe(NamedTuple):
+class CrystalRecipe(NamedTuple):
     """What a puller grows: charge, shape and growth rate of a whole crystal, and how the crystal gives off its heat.
 
     SI units; the numbers of the table ``[recipe]`` of a puller file. Only ``CzCrystal-v0`` reads them.
@@ -72,7 +72,7 @@ class Recipe(NamedTuple):
 
 def describe(kind: type[Any] = Parameters) -> dict[str, Quantity]:
     """Map the name of each field of this kind of tuple to its :class:`Quantity`."""
-    if kind in (Parameters, Recipe):
+    if kind in (Parameters, CrystalRecipe):
         return {name: MACHINE[name] for name in kind._fields}
     hints = get_type_hints(kind, include_extras=True)
     return {name: hints[name].__metadata__[0] for name in kind._fields}

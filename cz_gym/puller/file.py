@@ -19,13 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.physics.parameters import Parameters, Recipe, check_parameters
+from cz_gym.physics.parameters import CrystalRecipe, Parameters, check_parameters
 from cz_gym.physics.plant import RADIUS_LIMIT, check_height, make_puller
 from cz_gym.physics.quantities import MACHINE, Quantity, Range
 from cz_gym.process import HEATER_SCALE
 from cz_gym.support.errors import CzError
-from cz_gym.support.files import naming, write_files
-from cz_gym.support.names import unknown
+from cz_gym.support.files import name_file_in_errors, write_files
+from cz_gym.support.names import unknown_name_message
 from cz_gym.support.units import CELSIUS, KILO, MM
 
 FORMAT = 1
@@ -48,7 +48,7 @@ def read_numbers(text: str) -> tuple[Any, dict[str, Any], tuple[str, ...]]:
     if content.get("format") != FORMAT:
         raise CzError(f"expected 'format = {FORMAT}' at the top, not {content.get('format', 'nothing')!r:.40}")
     if odd := set(content) - {"format", "name", *TABLES}:
-        raise CzError(unknown("table", f"[{min(odd)}]", [f"[{table}]" for table in TABLES]))
+        raise CzError(unknown_name_message("table", f"[{min(odd)}]", [f"[{table}]" for table in TABLES]))
     numbers: dict[str, Any] = {}
     missing: list[str] = []
     for table, known in TABLES.items():
@@ -87,7 +87,7 @@ def _misplaced(table: str, key: str, known: Mapping[str, Quantity]) -> str:
             return f"{key} belongs in [{each.table}], not in [{table}]"
         if each.table == table and key.startswith(f"{each.stem or each.symbol}_"):
             return f"[{table}] has no key {key!r}: did you mean {each.key!r}?"
-    return unknown(f"key of [{table}]", key, known)
+    return unknown_name_message(f"key of [{table}]", key, known)
 
 
 def _read(value: Any, quantity: Quantity) -> Any:
@@ -138,7 +138,7 @@ class PullerFile:
 
     name: str = "default"
     parameters: Parameters = field(default_factory=Parameters)
-    recipe: Recipe = Recipe()  # noqa: RUF009  (immutable)
+    recipe: CrystalRecipe = CrystalRecipe()  # noqa: RUF009  (immutable)
     """The whole crystal that it grows."""
     heater_range: float = HEATER_SCALE
     heater_max: float | None = None
@@ -245,7 +245,7 @@ def value_of(puller: PullerFile, quantity: Quantity) -> Any:
 
 def read_puller(path: str | Path) -> PullerFile:
     """Read a puller file; CzError, one line that names the file, for anything that cannot be meant."""
-    with naming(path := Path(path)):
+    with name_file_in_errors(path := Path(path)):
         text = path.read_text("utf-8-sig")
     return replace(from_toml(text, path), file=path)
 
@@ -254,8 +254,11 @@ def from_toml(text: str, source: str | Path = "puller") -> PullerFile:
     """The puller of a file's text; CzError, one line that begins with the text's source, for what cannot be meant."""
     try:
         name, numbers, missing = read_numbers(text)
-        parts = ({each: numbers.pop(each) for each in kind._fields if each in numbers} for kind in (Parameters, Recipe))
-        parameters, recipe = Parameters(**next(parts)), Recipe(**next(parts))
+        parts = (
+            {each: numbers.pop(each) for each in kind._fields if each in numbers}
+            for kind in (Parameters, CrystalRecipe)
+        )
+        parameters, recipe = Parameters(**next(parts)), CrystalRecipe(**next(parts))
         return PullerFile(Path(source).stem if name is None else name, parameters, recipe, **numbers, missing=missing)
     except CzError as error:
         raise CzError(f"{source}: {' '.join(str(error).split())}") from None
@@ -278,7 +281,7 @@ def find_puller(given: str | Path | PullerFile | None) -> PullerFile:
     shipped, file = {each.stem: each for each in sorted(FOLDER.glob("*.toml"))}, Path(given)
     if file.suffix != ".toml" and not file.is_file():
         if str(given) not in shipped:
-            raise CzError(unknown("puller", str(given), shipped, ", or a file NAME.toml"))
+            raise CzError(unknown_name_message("puller", str(given), shipped, ", or a file NAME.toml"))
         file = shipped[str(given)]
     return read_puller(file)
 

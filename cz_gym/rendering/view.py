@@ -11,7 +11,7 @@ from cz_gym.body.process import BODY
 from cz_gym.config import Config
 from cz_gym.process import Process
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown
+from cz_gym.support.names import unknown_name_message
 
 from .canvas import MISSING, Frame, available, load
 from .picture import DRAWN, Picture, Record, record_for
@@ -46,7 +46,7 @@ def make_view(render_mode: str | None, size: Any, config: Config) -> "View | Non
     if render_mode is None:
         return None
     if render_mode not in MODES:
-        raise CzError(unknown("render_mode", render_mode, ["None", *MODES]))
+        raise CzError(unknown_name_message("render_mode", render_mode, ["None", *MODES]))
     if not available():
         raise DependencyNotInstalled(MISSING)
     if not declared_modes(config.process):

@@ -50,9 +50,9 @@ class OneLineParser(argparse.ArgumentParser):
         extra: str,
         left: str = "nothing written",
     ) -> int:
-        """Parse the arguments and run the command's body on them, as :func:`guarded` does; returns the exit code."""
+        """Parse the arguments and run the command's body on them (:func:`run_command`); return the exit code."""
         given = self.parse_args(arguments)
-        return guarded(self.prog, lambda: body(given) or 0, extra, left)
+        return run_command(self.prog, lambda: body(given) or 0, extra, left)
 
 
 def between(least: int, most: int) -> Callable[[str], int]:
@@ -70,7 +70,7 @@ def between(least: int, most: int) -> Callable[[str], int]:
     return number
 
 
-def guarded(prog: str, body: Callable[[], int], extra: str, left: str = "nothing written") -> int:
+def run_command(prog: str, body: Callable[[], int], extra: str, left: str = "nothing written") -> int:
     """Run a command's body and return its exit code.
 
     One line on stderr tells of a :class:`CzError`, a missing package of the project's extras, and Ctrl-C; a closed pipe
@@ -108,7 +108,7 @@ def missing(module: str, extra: str) -> str:
     return f'{module} is missing: pip install ".[{OWN_EXTRA.get(module, extra)}]"'
 
 
-def shown(path: str | Path) -> str:
+def relative_path(path: str | Path) -> str:
     """Return the path relative to the current folder if it lies below it, else absolute."""
     whole, here = Path(path).absolute(), Path.cwd()
     return str(whole.relative_to(here) if whole.is_relative_to(here) else whole)
@@ -116,4 +116,4 @@ def shown(path: str | Path) -> str:
 
 def interpreter() -> str:
     """Return the path of the running Python as a command line would name it."""
-    return shown(sys.executable) if sys.executable else "python"
+    return relative_path(sys.executable) if sys.executable else "python"

@@ -17,7 +17,7 @@ LOCK = ".lock"
 
 
 @contextmanager
-def naming(path: str | Path) -> Iterator[None]:
+def name_file_in_errors(path: str | Path) -> Iterator[None]:
     """Context in which a file or folder that the user named is read or written.
 
     An OSError inside, and text that is not UTF-8, become a CzError that says which path and why.
@@ -42,14 +42,14 @@ def write_files(files: Mapping[Path, bytes]) -> None:
             if path.is_dir():
                 raise CzError(f"{path} is a folder")
             staged[path] = path.with_name(f".{path.name}.{os.getpid()}.new")
-            with naming(path):
+            with name_file_in_errors(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with open(staged[path], "wb") as file:
                     file.write(content)
                     file.flush()
                     os.fsync(file.fileno())
         for path, new in staged.items():
-            with naming(path):
+            with name_file_in_errors(path):
                 os.replace(new, path)
     finally:
         for new in staged.values():
@@ -67,7 +67,7 @@ def locked(folder: Path, patience: float = 0.0) -> Iterator[None]:
 
     lock = FileLock(folder / LOCK, timeout=patience)
     new = [each for each in (folder, *folder.parents) if not each.exists()]
-    with naming(folder):
+    with name_file_in_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try:
             lock.acquire()
@@ -91,5 +91,5 @@ def check_writable(path: Path) -> None:
         existing = existing.parent
     if not existing.is_dir():
         raise CzError(f"{path}: {existing} is not a folder")
-    with naming(path), tempfile.TemporaryFile(dir=existing):
+    with name_file_in_errors(path), tempfile.TemporaryFile(dir=existing):
         pass

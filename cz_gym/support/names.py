@@ -13,7 +13,7 @@ import numpy as np
 from .errors import CzError, UnexpectedKeyword
 
 
-def needs(kind: type, value: Any, how: str) -> Any:
+def require_type(kind: type, value: Any, how: str) -> Any:
     """Return the value; raise CzError with a hint on how to make one unless it is of this type."""
     if not isinstance(value, kind):
         name, given = kind.__name__, " ".join(repr(value).split())
@@ -21,7 +21,7 @@ def needs(kind: type, value: Any, how: str) -> Any:
     return value
 
 
-def unknown(kind: str, name: object, known: Iterable[str], also: str = "") -> str:
+def unknown_name_message(kind: str, name: object, known: Iterable[str], also: str = "") -> str:
     """One line: the unknown name, the closest known one, all known ones, and what else (``also``) is accepted."""
     names = list(known)
     close = get_close_matches(name, names, 1, 0.65) if isinstance(name, str) else []
@@ -29,13 +29,15 @@ def unknown(kind: str, name: object, known: Iterable[str], also: str = "") -> st
     return f"unknown {kind} {name!r:.80}{meant} from {', '.join(names) or 'none'}{also}"
 
 
-def known_keywords(given: Iterable[str], *functions: Callable[..., Any]) -> None:
+def check_keywords(given: Iterable[str], *functions: Callable[..., Any]) -> None:
     """Raise UnexpectedKeyword for the first keyword that none of the functions has."""
     parameters = [each for function in functions for each in inspect.signature(function).parameters.values()]
     known = dict.fromkeys(each.name for each in parameters if each.name != "self" and each.kind != each.VAR_KEYWORD)
     for name in given:
         if name not in known:
-            raise UnexpectedKeyword(unknown("keyword argument", name, known).replace("unknown", "unexpected", 1))
+            raise UnexpectedKeyword(
+                unknown_name_message("keyword argument", name, known).replace("unknown", "unexpected", 1)
+            )
 
 
 # Functions on nested tuples of arrays: the memories of controllers, and records of one kind.

@@ -11,9 +11,9 @@ from cz_gym.crystal.process import CRYSTAL
 from cz_gym.evaluation import user_code
 from cz_gym.evaluation.protocol import CRYSTAL_CASES, ENVIRONMENTS, SLOW_EPISODES, Case, Contender, agent, find_case
 from cz_gym.puller.file import chosen_puller
-from cz_gym.support.command_line import OneLineParser, between, guarded, shown
+from cz_gym.support.command_line import OneLineParser, between, relative_path, run_command
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown
+from cz_gym.support.names import unknown_name_message
 from cz_gym.support.units import MM
 from cz_gym.tools.report.markdown import terminal
 
@@ -53,7 +53,12 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     add("--episodes", type=between(1, EPISODES), default=EPISODES, metavar="N", help=about)
     add("--controllers", type=_names, metavar="A,B", help='controllers and agents by name, or "all"')
     add("--scenarios", type=_names, metavar="A,B", help="scenarios by name")
-    add("--out", type=Path, metavar="DIR", help=f"folder for the results ({shown(FOLDER)}; of your own: runs/NAME)")
+    add(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help=f"folder for the results ({relative_path(FOLDER)}; of your own: runs/NAME)",
+    )
     add("--json", type=Path, metavar="FILE", help="write benchmark.json to FILE, and only that unless --out is given")
     agent_help = (
         "agent file, by default in place of the shipped ones; those of one NAME (default: the algorithm's) are "
@@ -67,7 +72,9 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_puller("every case runs on it, with the controllers that are designed for it")
     about = "largest deviation of the diameter that is no scrap, in the report for --puller [mm] (1)"
     add("--tolerance", type=float, metavar="MM", help=about)
-    add("--slow", action="store_true", help=f"slow controllers too, on 50 episodes; resumed from {shown(CACHE)}")
+    add(
+        "--slow", action="store_true", help=f"slow controllers too, on 50 episodes; resumed from {relative_path(CACHE)}"
+    )
     parser.add_cluster()
     add("--overwrite", action="store_true", help="replace files of earlier or other runs")
     add("--quiet", action="store_true", help="no progress bar, no table; a bar is shown on a terminal only")
@@ -97,7 +104,7 @@ def main(argv: Sequence[str]) -> int:
         mine += [Path(arguments.puller).stem] if arguments.puller else []
         arguments.out = OWN / "-".join(dict.fromkeys(mine)) if mine else folder_of(arguments)
     command = shlex.join(["cz-gym", "benchmark", *argv])
-    return guarded("cz-gym benchmark", lambda: benchmark(arguments, command), "benchmark")
+    return run_command("cz-gym benchmark", lambda: benchmark(arguments, command), "benchmark")
 
 
 def folder_of(arguments: argparse.Namespace) -> Path:
@@ -130,8 +137,8 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
         if arguments.controllers == ["all"] and slow:
             names = ", ".join(sorted(slow))
             print(f"left out of all: {names}, which are slow and not cached for every episode; add --slow to run them")
-        wrote = ", ".join(shown(path) for path in (arguments.out, arguments.json) if path)
-        print(f"wrote {wrote}" + (f"; open {shown(arguments.out / 'report.html')}" if arguments.out else ""))
+        wrote = ", ".join(relative_path(path) for path in (arguments.out, arguments.json) if path)
+        print(f"wrote {wrote}" + (f"; open {relative_path(arguments.out / 'report.html')}" if arguments.out else ""))
     return 0
 
 
@@ -176,7 +183,7 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
         wanted = [each.name for each in controllers if may_run(each)] + agents
     for name in wanted:
         if name not in (known := [*names, *new, *shipped]):
-            raise CzError(unknown("controller", name, known, ", or all"))
+            raise CzError(unknown_name_message("controller", name, known, ", or all"))
     chosen = [each for each in controllers if each.name in wanted]
     for each in chosen:
         if not may_run(each):

@@ -34,7 +34,7 @@ from cz_gym.spaces import DRIVE_CHANNELS, drives_of, to_measured
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import check_writable
-from cz_gym.support.names import unknown
+from cz_gym.support.names import unknown_name_message
 from cz_gym.tools.identify.moves import Excited
 
 CONTROLLERS, AGENTS = "cz_gym.tools.registry:CONTROLLERS", "cz_gym.agents:load"
@@ -84,7 +84,7 @@ def find_policy(name: str, config: Config) -> Any:
     try:
         settings = settings_of(load(name))
     except ValueError as error:
-        raise CzError(unknown("policy", name, [*controllers, *OWN], f"; or an agent: {error}")) from None
+        raise CzError(unknown_name_message("policy", name, [*controllers, *OWN], f"; or an agent: {error}")) from None
     return load(name, replace(config, **settings))
 
 

@@ -16,7 +16,7 @@ from cz_gym.evaluation.protocol import contract_hash
 from cz_gym.evaluation.results import BOUND, REFERENCE, Result
 from cz_gym.evaluation.statistics import RESAMPLES, SEED, Estimate
 from cz_gym.support.errors import CzError
-from cz_gym.support.files import check_writable, naming, write_files
+from cz_gym.support.files import check_writable, name_file_in_errors, write_files
 from cz_gym.support.names import software
 
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime")
@@ -64,7 +64,7 @@ def write(
         files[folder / "report.md"] = markdown(results, command, figures).encode()
         files[folder / "report.html"] = page(results, command).encode()
         for each in filter(Path.is_file, quoted):
-            with naming(each):
+            with name_file_in_errors(each):
                 before = each.read_text("utf-8")
             files[each] = fill_in(before, results).encode()
         files[folder / RESULTS] = text
@@ -181,7 +181,7 @@ def read_results(path: Path, metrics: Sequence[str]) -> tuple[dict[str, dict[str
 
     The hash is empty in a file of an earlier release. Raises CzError for other files.
     """
-    with naming(path):
+    with name_file_in_errors(path):
         text = path.read_text("utf-8")
     try:
         content = json.loads(text)
@@ -208,7 +208,7 @@ def read_episodes(path: Path, columns: Sequence[str]) -> Episodes:
     seeds did not meet the same number of crystals.
     """
     lines: dict[str, dict[str, dict[str, list[list[float]]]]] = {}
-    with naming(path):
+    with name_file_in_errors(path):
         text = path.read_text("utf-8")
     try:
         for line in csv.DictReader(io.StringIO(text)):

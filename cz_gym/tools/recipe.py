@@ -15,7 +15,7 @@ from cz_gym.crystal.process import CRYSTAL, lengths, nominal_recipe
 from cz_gym.crystal.recipe import shape_at
 from cz_gym.episodes.draw import Episode
 from cz_gym.puller.file import PullerFile, chosen_puller
-from cz_gym.support.command_line import OneLineParser, shown
+from cz_gym.support.command_line import OneLineParser, relative_path
 from cz_gym.support.files import write_files
 from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
@@ -109,4 +109,4 @@ def _main(given: argparse.Namespace) -> None:
     print(" ".join(f"{heading:>11}" for heading in headed))
     for i in every:
         print(" ".join(f"{column[i]:>11.4g}" for column in headed.values()))
-    print("wrote", ", ".join(shown(path) for path in files))
+    print("wrote", ", ".join(relative_path(path) for path in files))

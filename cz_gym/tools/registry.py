@@ -17,7 +17,7 @@ from cz_gym.crystal.process import CRYSTAL
 from cz_gym.evaluation.protocol import Contender, unchanged
 from cz_gym.process import Process
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown
+from cz_gym.support.names import unknown_name_message
 
 
 def _changed(change: Callable[[LQG], Policy], tuned: TunedLQG, config: Config) -> Policy:
@@ -111,7 +111,7 @@ def find_controller(name: str, process: Process = BODY) -> Contender:
     for entry in known:
         if entry.name == name:
             return entry
-    raise CzError(unknown("controller", name, [entry.name for entry in known]))
+    raise CzError(unknown_name_message("controller", name, [entry.name for entry in known]))
 
 
 def make_controller(name: str, config: Config) -> Policy:

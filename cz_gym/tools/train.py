@@ -10,7 +10,7 @@ from cz_gym.agents.recipes import CRYSTAL, CRYSTAL_RECIPES, CZ, DEFAULT, FEW_UPD
 from cz_gym.agents.train import read_settings
 from cz_gym.config import check_config
 from cz_gym.puller.file import chosen_puller
-from cz_gym.support.command_line import OneLineParser, between, guarded, interpreter
+from cz_gym.support.command_line import OneLineParser, between, interpreter, run_command
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import check_writable, locked
 
@@ -59,7 +59,7 @@ def main(argv: Sequence[str]) -> int:
     words = ["-m", "cz_gym", "train", *(word for word in argv if word != "--resume"), "--resume"]
     left = f"{shlex.join([interpreter(), *words])} continues from the last checkpoint"
     extras = "agents,benchmark" if arguments.plot else "agents"
-    return guarded("cz-gym train", lambda: train(arguments), extras, left)
+    return run_command("cz-gym train", lambda: train(arguments), extras, left)
 
 
 def train(arguments: argparse.Namespace) -> int:

@@ -23,9 +23,9 @@ from cz_gym.crystal.process import CRYSTAL, ENVIRONMENTS
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.evaluation.parallel import side_by_side
 from cz_gym.puller.file import FOLDER, PullerFile, chosen_puller
-from cz_gym.support.command_line import OneLineParser, between, shown
+from cz_gym.support.command_line import OneLineParser, between, relative_path
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown
+from cz_gym.support.names import unknown_name_message
 
 _ALL: tuple[Tuned | TunedCrystal, ...] = (*PIDS, *LQGS, *CRYSTALS)
 CZ = "Cz-v0"
@@ -67,7 +67,7 @@ def _tune(given: argparse.Namespace) -> None:
     scenario = find_scenario(name)
     tuned = known.get(given.controller)
     if tuned is None:
-        raise CzError(unknown("controller to tune", given.controller, known))
+        raise CzError(unknown_name_message("controller to tune", given.controller, known))
     trials, episodes, interval = given.trials or 100, given.episodes or 100, given.control_interval or 5.0
     if isinstance(tuned, TunedCrystal):
         if scenario != RANDOMIZED:
@@ -82,7 +82,7 @@ def _tune(given: argparse.Namespace) -> None:
     print(f"{tuned.name} on {name}: score {chosen.score:.4f} on validation crystals")
     for parameter, value in zip(search.goal.parameters, chosen.values, strict=True):
         print(f"  {parameter.path} = {value:.6g}")
-    print(f"wrote {shown(path)}")
+    print(f"wrote {relative_path(path)}")
 
 
 def tunable(given: argparse.Namespace) -> dict[str, Tuned | TunedCrystal]:
@@ -96,7 +96,7 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
 
     known = {name: each for name, each in tunable(given).items() if getattr(each, "searched_on_puller", True)}
     if given.controller not in (None, *known):
-        raise CzError(unknown("controller to tune for a puller", given.controller, known))
+        raise CzError(unknown_name_message("controller to tune for a puller", given.controller, known))
     alike = [each for each in known.values() if isinstance(each, TunedCrystal) == (given.env != CZ)]
     searched = [known[given.controller]] if given.controller else alike
     crystals = isinstance(searched[0], TunedCrystal)

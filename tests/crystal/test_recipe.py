@@ -12,7 +12,7 @@ from cz_gym.crystal.recipe import growth_rate, shape_at
 from cz_gym.env import CzCrystalEnv
 from cz_gym.episodes.draw import Episode
 from cz_gym.physics.meniscus import HURLE
-from cz_gym.physics.parameters import Recipe
+from cz_gym.physics.parameters import CrystalRecipe
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.puller.file import DEFAULT, PullerFile, find_puller, from_toml
 from cz_gym.support.errors import CzError
@@ -61,7 +61,7 @@ def test_the_recipe_reads_as_the_design_says():
 )
 def test_what_cannot_be_grown_is_refused_in_one_line(changes, said):
     with pytest.raises(CzError, match=said) as refused:
-        make_config(process=CRYSTAL, puller=PullerFile("odd", recipe=Recipe()._replace(**changes)))
+        make_config(process=CRYSTAL, puller=PullerFile("odd", recipe=CrystalRecipe()._replace(**changes)))
     assert "\n" not in str(refused.value)
 
 
@@ -90,7 +90,7 @@ def test_the_body_alone_has_no_stage():
 def test_stage_and_recipe_in_hashes():
     """The recipe is part of the plant, the stage of what a saved state depends on."""
     crown, whole = (make_config(process=CRYSTAL, stage=stage) for stage in ("crown", "whole"))
-    slow = PullerFile("slow", recipe=Recipe(v_body=1.9e-5))
+    slow = PullerFile("slow", recipe=CrystalRecipe(v_body=1.9e-5))
     assert crown.plant_hash == whole.plant_hash != make_config(process=CRYSTAL, puller=slow).plant_hash
     assert crown.hash != whole.hash
     assert slow.hash == DEFAULT.hash
@@ -99,7 +99,7 @@ def test_stage_and_recipe_in_hashes():
 
 def test_a_recipe_in_a_pullers_file():
     told = from_toml("format = 1\n[recipe]\ncharge_kg = 100\nbody_length_mm = 1300\n")
-    assert told.recipe == Recipe(M_0=100.0, body_length=1.3)
+    assert told.recipe == CrystalRecipe(M_0=100.0, body_length=1.3)
     with pytest.raises(CzError, match="charge_kg = 80000"):
         from_toml("format = 1\n[recipe]\ncharge_kg = 80000\n")
 

@@ -8,7 +8,7 @@ from cz_gym import CzEnv, CzVectorEnv, Parameters
 from cz_gym.config import make_config
 from cz_gym.engine.tangents import DifferentiableBatch
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.spaces import mark
+from cz_gym.spaces import tag
 from tests.observed import PLAIN
 
 OWN = make_config(horizon=600.0, **PLAIN)
@@ -37,10 +37,10 @@ def step(request):
 )
 def test_step_refuses_what_was_made_for_another_environment(step, other, named):
     take, action = step
-    theirs = mark(action, make_config(horizon=600.0, **other).made_for)
+    theirs = tag(action, make_config(horizon=600.0, **other).made_for)
     with pytest.raises(InvalidAction, match=f"was made for .*{named}.*; the environment has .*gym.make"):
         take(theirs)
     take(np.asarray(theirs))
     take(np.clip(2.0 * theirs, -1.0, 1.0))
-    take(mark(action, make_config("hard", **PLAIN).made_for))
-    take(mark(action, None))
+    take(tag(action, make_config("hard", **PLAIN).made_for))
+    take(tag(action, None))

@@ -30,11 +30,11 @@ from cz_gym.jit import cache_folder
 print(cache_folder())
 """
 CURVES = """
-from cz_gym.support.command_line import guarded
+from cz_gym.support.command_line import run_command
 def body():
     from matplotlib.figure import Figure
     return print(7) or 0
-guarded("command", body, "benchmark")
+run_command("command", body, "benchmark")
 """
 
 

@@ -10,7 +10,7 @@ from scipy import stats
 
 from cz_gym import SCENARIOS, Parameters, Scenario, make_puller
 from cz_gym.episodes.draw import FREEZES, Episode, Factors, episode_from_key, factors_from_key, new_series, randomised
-from cz_gym.episodes.scenario import Actuators, Draw, Faults, Interface, Recipe, Reference, Sensor
+from cz_gym.episodes.scenario import Actuators, Faults, Interface, Recipe, Reference, Sensor, Variation
 
 MM, MINUTE, SPAN = 1e-3, 60.0, 10800.0
 WORD = st.integers(0, 2**64 - 1)
@@ -121,10 +121,10 @@ def test_every_member_says_whether_it_is_random(family, member, spread):
     says, whole = member.metadata["member"], isinstance(np.ravel(member.default)[0].item(), int)
     high = says.quantity.high if whole else min(0.5 * says.quantity.high * says.quantity.size, 100.0)
     low = high if not spread else 0 if whole else spread * high
-    value = (low, high) if isinstance(member.default, tuple) else low if says.draw is Draw.CHANCE else high
+    value = (low, high) if isinstance(member.default, tuple) else low if says.draw is Variation.CHANCE else high
     part = dataclasses.replace(getattr(BESIDE, family), **{member.name: value})
     scenario = dataclasses.replace(BESIDE, **{family: part})
-    random = says.draw in (Draw.NONZERO, Draw.CHANCE) or (says.draw is Draw.RANGE and low != high)
+    random = says.draw in (Variation.NONZERO, Variation.CHANCE) or (says.draw is Variation.RANGE and low != high)
     assert scenario.deterministic is not random
     drawn = [
         (factors_from_key(scenario, part.mix, key) if family == "pullers" else (), felt(scenario, key))

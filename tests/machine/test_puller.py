@@ -13,7 +13,7 @@ from cz_gym.engine.tangents import DifferentiableBatch
 from cz_gym.env import CzEnv
 from cz_gym.episodes.adapt import adapt_scenario
 from cz_gym.episodes.scenarios import ALL, HARD, PULLER, RANDOMIZED
-from cz_gym.physics.parameters import Parameters, Recipe
+from cz_gym.physics.parameters import CrystalRecipe, Parameters
 from cz_gym.physics.quantities import MACHINE
 from cz_gym.puller.file import (
     DEFAULT,
@@ -49,7 +49,7 @@ def pullers(draw):
     for symbol, quantity in MACHINE.items():
         if symbol in AS_THEY_ARE:
             continue
-        parts = (part for part, kind in ((parameters, Parameters), (recipe, Recipe)) if symbol in kind._fields)
+        parts = (part for part, kind in ((parameters, Parameters), (recipe, CrystalRecipe)) if symbol in kind._fields)
         middle, part = value_of(DEFAULT, quantity), next(parts, own)
         low, high = (max(quantity.low, -100.0) * quantity.size, min(quantity.high, 100.0) * quantity.size)
         if part is not own:
@@ -59,7 +59,7 @@ def pullers(draw):
             other = draw(st.floats(low, high, allow_subnormal=False))
             part[symbol] = tuple(sorted((value, other))) if quantity.drawn else value
     name = draw(st.sampled_from(["my puller", "Züchtung 3", '"q"\\']))
-    return PullerFile(name, Parameters(**parameters), Recipe(**recipe), **own)
+    return PullerFile(name, Parameters(**parameters), CrystalRecipe(**recipe), **own)
 
 
 @settings(max_examples=60, deadline=None)

@@ -8,7 +8,7 @@ import pytest
 
 from cz_gym.support import files
 from cz_gym.support.errors import CzError
-from cz_gym.support.files import LOCK, check_writable, locked, naming, write_files
+from cz_gym.support.files import LOCK, check_writable, locked, name_file_in_errors, write_files
 from tests.processes import python
 
 KILL_AT_EVERY_LINE = """
@@ -90,9 +90,9 @@ def test_a_place_where_no_file_can_be_is_named(place, reason, tmp_path):
 def test_a_file_that_cannot_be_read_is_named_with_the_reason(tmp_path):
     (tmp_path / "latin").write_bytes(b"\xe9")
     for name, reason in (("none", "No such file or directory"), ("latin", "not a text file in UTF-8")):
-        with pytest.raises(CzError, match=f"^{tmp_path / name}: {reason}$"), naming(tmp_path / name):
+        with pytest.raises(CzError, match=f"^{tmp_path / name}: {reason}$"), name_file_in_errors(tmp_path / name):
             (tmp_path / name).read_text("utf-8")
-    with pytest.raises(KeyError), naming(tmp_path):
+    with pytest.raises(KeyError), name_file_in_errors(tmp_path):
         raise KeyError("any other error passes")
 
 

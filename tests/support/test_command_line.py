@@ -13,7 +13,7 @@ from gymnasium.error import DependencyNotInstalled
 
 import cz_gym_command
 from cz_gym import __version__
-from cz_gym.support.command_line import OPTIONAL, guarded
+from cz_gym.support.command_line import OPTIONAL, run_command
 from cz_gym.support.errors import CzError
 from cz_gym.tools import benchmark, datasets, play, tune
 from studies import speed
@@ -146,9 +146,9 @@ def test_only_what_is_meant_for_the_user_is_one_line_and_a_bug_keeps_its_traceba
 
     if code is None and error is not None:
         with pytest.raises(type(error)):
-            guarded("prog", body, "agents")
+            run_command("prog", body, "agents")
     else:
-        assert guarded("prog", body, "agents", "runs are complete") == code
+        assert run_command("prog", body, "agents", "runs are complete") == code
     assert capsys.readouterr().err == said
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from cz_gym.config import make_config
 from cz_gym.spaces import CLIP
-from cz_gym.support.command_line import OneLineParser, shown
+from cz_gym.support.command_line import OneLineParser, relative_path
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import write_files
 from cz_gym.support.units import KILO, MM_PER_MIN
@@ -49,7 +49,7 @@ def _export(given: argparse.Namespace) -> None:
     if given.plant:
         from .fmu import build_fmu
 
-        print(shown(build_fmu(given.out, config.scenario.name, config.puller if given.puller else None)))
+        print(relative_path(build_fmu(given.out, config.scenario.name, config.puller if given.puller else None)))
         return
     block = make_block(given.controller, config)
     if given.shadow:
@@ -59,7 +59,7 @@ def _export(given: argparse.Namespace) -> None:
         files["README.md"] = readme(block, list(files), given.real == "float")
         _check_own(given.out, block.program)
     write_files({given.out / name: text.encode() if isinstance(text, str) else text for name, text in files.items()})
-    print(*(shown(given.out / name) for name in files), sep="\n")
+    print(*(relative_path(given.out / name) for name in files), sep="\n")
 
 
 def _check_own(folder: Path, program: Program) -> None:

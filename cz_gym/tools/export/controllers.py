@@ -18,7 +18,7 @@ from cz_gym.process import scales
 from cz_gym.puller.file import DEFAULT
 from cz_gym.spaces import CLIP, HEATER_SLACK, HISTORY, INTEGRAL_SCALE, LAGGED, MEASURED, drives_of, lags
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown
+from cz_gym.support.names import unknown_name_message
 
 from .shell import Block
 
@@ -202,7 +202,7 @@ def make_block(name: str, config: Config) -> Block:
     known = [entry.name for entry in pkgutil.resolve_name(f"{REGISTRY}:CONTROLLERS") if not entry.bound]
     plant = f"Puller {config.puller.label}; plant {config.plant_hash}; control interval {config.control_interval:g} s."
     if name not in (*known, FALLBACK, *agents.shipped_names()) and Path(name).suffix != ".onnx":
-        raise CzError(unknown("controller or agent", name, [*known, FALLBACK, *agents.shipped_names()]))
+        raise CzError(unknown_name_message("controller or agent", name, [*known, FALLBACK, *agents.shipped_names()]))
     pid, *margins = pkgutil.resolve_name(SEARCH)(config)
     fallback = (
         f"Fallback: PID searched for this puller with the drives and the camera of scenario {config.scenario.name}: "

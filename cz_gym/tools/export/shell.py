@@ -24,7 +24,7 @@ from cz_gym.body.process import INPUTS as COLUMNS
 from cz_gym.body.process import STATES, linearise
 from cz_gym.body.signals import Measured
 from cz_gym.config import Config
-from cz_gym.spaces import MadeFor, decode, mark
+from cz_gym.spaces import TargetEnv, decode, tag
 from cz_gym.support.names import select
 from cz_gym.support.units import KILO, MINUTE, MM_PER_MIN
 
@@ -261,7 +261,7 @@ class BlockPolicy:
     """Control interval of the environment, if it is another one than the block's [s]."""
 
     @property
-    def made_for(self) -> MadeFor:
+    def made_for(self) -> TargetEnv:
         """The environment that takes its actions."""
         made_for = self.block.config.made_for
         return made_for._replace(action=self.action, control_interval=self.interval or made_for.control_interval)
@@ -279,8 +279,8 @@ class BlockPolicy:
             state = BlockState(samples, memory, state.outputs)
         outputs, memory = runner.run(self.inputs(rows, state.samples), state.memory)
         action = self.action_of(outputs)
-        marked = mark(action[0] if np.ndim(observation) == 1 else action, self.made_for)
-        return marked, BlockState(state.samples + 1, memory, outputs)
+        tagged = tag(action[0] if np.ndim(observation) == 1 else action, self.made_for)
+        return tagged, BlockState(state.samples + 1, memory, outputs)
 
     def inputs(self, rows: Any, samples: Any) -> dict[str, Any]:
         """The block's inputs for observations of shape (n, channels) at those samples of their episodes."""

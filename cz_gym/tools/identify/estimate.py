@@ -12,7 +12,7 @@ from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.puller.file import DEFAULT, PullerFile
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown
+from cz_gym.support.names import unknown_name_message
 from cz_gym.support.units import KILO, MM
 
 from .log import Floats, Log, join, prepare, shift_drives
@@ -252,7 +252,9 @@ def _prior_sds(given: Mapping[str, float]) -> dict[str, float]:
     sds |= {"heater_lag": LAG_SD, "pyrometer_filter": LAG_SD, "heater_dead_time": DEAD_SD}
     for name, value in given.items():
         if name not in sds or not 0.0 < value < np.inf:
-            raise CzError(unknown("parameter", name, sds) if name not in sds else f"prior of {name}: {value!r}")
+            raise CzError(
+                unknown_name_message("parameter", name, sds) if name not in sds else f"prior of {name}: {value!r}"
+            )
         sds[name] = value
     return sds
 

@@ -15,8 +15,8 @@ from cz_gym.physics.plant import make_puller
 from cz_gym.puller.file import PullerFile
 from cz_gym.spaces import decode
 from cz_gym.support.errors import CzError
-from cz_gym.support.files import naming, write_files
-from cz_gym.support.names import unknown
+from cz_gym.support.files import name_file_in_errors, write_files
+from cz_gym.support.names import unknown_name_message
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 Units = dict[str, tuple[float, float]]
@@ -359,7 +359,7 @@ def column_map(given: Sequence[str], file: Path | None = None) -> dict[str, tupl
     """
     pairs: list[tuple[str, Any]] = []
     if file is not None:
-        with naming(file):
+        with name_file_in_errors(file):
             try:
                 pairs = list(tomllib.loads(file.read_text(encoding="utf-8-sig")).items())
             except tomllib.TOMLDecodeError as error:
@@ -368,11 +368,11 @@ def column_map(given: Sequence[str], file: Path | None = None) -> dict[str, tupl
     columns = {}
     for name, text in pairs:
         if name not in COLUMNS:
-            raise CzError(unknown("column", name, COLUMNS))
+            raise CzError(unknown_name_message("column", name, COLUMNS))
         own = next(iter(COLUMNS[name]))
         column, colon, unit = str(text).rpartition(":")
         if colon and unit not in COLUMNS[name]:
-            raise CzError(unknown(f"unit of {name}", unit, COLUMNS[name]))
+            raise CzError(unknown_name_message(f"unit of {name}", unit, COLUMNS[name]))
         columns[name] = (column, unit) if colon else (unit, own)
         if not columns[name][0]:
             raise CzError(f"{name}: say which column it is, as {name}=COLUMN:{own}")
@@ -391,14 +391,16 @@ def read_log(path: str | Path, columns: Mapping[str, tuple[str, str]] | None = N
 
     named = {name: (name, next(iter(units))) for name, units in COLUMNS.items()} | dict(columns or {})
     try:
-        with naming(path):
+        with name_file_in_errors(path):
             file, line = text_table(Path(path), {column for column, _ in named.values()})
         if (time := named["time_s"][0]) not in file and set(parts := time.split("+")) <= set(file):
             file[time] = file[parts].fillna("").agg(" ".join, axis=1)
         for name in (*REQUIRED, *(columns or {})):
             if (column := named[name][0]) not in file:
                 own = next(iter(COLUMNS[name]))
-                raise CzError(f"{unknown('column', column, file)}; {name}=COLUMN:{own} says which one it is")
+                raise CzError(
+                    f"{unknown_name_message('column', column, file)}; {name}=COLUMN:{own} says which one it is"
+                )
         present = {name: (column, unit) for name, (column, unit) in named.items() if column in file}
         for column, _ in present.values():
             if isinstance(file[column], pandas.DataFrame):

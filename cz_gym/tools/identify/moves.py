@@ -18,7 +18,7 @@ from scipy.signal import lfilter, max_len_seq
 from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.plant import make_puller
 from cz_gym.puller.file import DEFAULT, PullerFile
-from cz_gym.spaces import DRIVE_CHANNELS, HEATER_RANGE, decode, drives_of, mark
+from cz_gym.spaces import DRIVE_CHANNELS, HEATER_RANGE, decode, drives_of, tag
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import MINUTE, MM
 
@@ -227,5 +227,5 @@ class Excited:
         given = np.atleast_2d(np.asarray(action, np.float64))
         out = np.clip(given + drives.asked(wanted, before), -1.0, 1.0)
         added = drives.keep * before + (out - given) * (drives.pull, drives.heater)
-        marked = mark((out[0] if single else out).astype(np.float32), self.made_for)
-        return marked, Memory(inner, step + 1, added, stopped)
+        tagged = tag((out[0] if single else out).astype(np.float32), self.made_for)
+        return tagged, Memory(inner, step + 1, added, stopped)

@@ -28,7 +28,7 @@ from cz_gym.rendering.canvas import Frame
 from cz_gym.rendering.view import record_of
 from cz_gym.spaces import CLIP, decode
 from cz_gym.support.errors import CzError
-from cz_gym.support.files import check_writable, naming, write_files
+from cz_gym.support.files import check_writable, name_file_in_errors, write_files
 from cz_gym.support.names import leaves, map_arrays
 from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN
 from cz_gym.tools.export.block import INPUTS, OUTPUTS, SETPOINTS, in_plant_units, settings_of
@@ -63,7 +63,7 @@ class LogFile:
         while self._name(self._part + 1).exists():
             self._part += 1
         if (path := self._name(self._part)).exists():
-            with naming(path):
+            with name_file_in_errors(path):
                 head, *rows = path.read_text("utf-8").splitlines(keepends=True)
             before = [row for row in rows if float(row.split(",")[0]) <= resumed_at]
             write_files({path: "".join([head, *before]).encode()})
@@ -88,7 +88,7 @@ class LogFile:
         return self.path if part == 1 else self.path.with_stem(f"{self.path.stem}-{part}")
 
     def _open(self, flags: int) -> None:
-        with naming(path := self._name(self._part)):
+        with name_file_in_errors(path := self._name(self._part)):
             self._file = os.open(path, os.O_WRONLY | flags, 0o644)
             self._size = os.fstat(self._file).st_size
 
@@ -119,7 +119,7 @@ class StateFile:
         check_writable(self.path.absolute().parent)
         if not self.path.exists():
             return None
-        with naming(self.path):
+        with name_file_in_errors(self.path):
             content = self.path.read_bytes()
         try:
             with np.load(io.BytesIO(content), allow_pickle=False) as file:

@@ -19,7 +19,7 @@ from asyncua.server.user_managers import UserManager
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from cz_gym.support.errors import CzError
-from cz_gym.support.files import check_writable, naming
+from cz_gym.support.files import check_writable, name_file_in_errors
 
 from .machine import TAGS, Clock, Machine, Tag
 
@@ -226,7 +226,7 @@ async def certify(folder: Path) -> None:
         return
     mask = os.umask(0o077)
     try:
-        with naming(folder):
+        with name_file_in_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
         check_writable(folder)
         use, der = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH], folder / "certificate.der"

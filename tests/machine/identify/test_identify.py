@@ -11,7 +11,7 @@ from cz_gym.baselines.policy import OpenLoop
 from cz_gym.episodes.scenario import Reference
 from cz_gym.physics.plant import make_puller
 from cz_gym.puller.file import DEFAULT, find_puller
-from cz_gym.spaces import HEATER_RANGE, MEASURED, MadeFor, decode
+from cz_gym.spaces import HEATER_RANGE, MEASURED, TargetEnv, decode
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import MM
 from cz_gym.tools.identify import Excited, identify, read_log, record_log
@@ -201,7 +201,7 @@ def test_excitation_stops_for_good_beyond_a_radius_error():
         assert bool(np.abs(action).any()) is moves
     with pytest.raises(CzError, match="amplitudes"):
         Excited(OpenLoop(), pull=0.5)
-    agent = SimpleNamespace(control_interval=2.0, made_for=MadeFor("rate", 2.0, "1234", "mine (5678)"))
+    agent = SimpleNamespace(control_interval=2.0, made_for=TargetEnv("rate", 2.0, "1234", "mine (5678)"))
     with pytest.raises(CzError, match="does not say its puller's numbers"):
         Excited(agent)
 
