@@ -14,7 +14,7 @@ from tests.processes import python
 KILL_AT_EVERY_LINE = """
 import os, signal, sys
 from pathlib import Path
-from cz_gym.support import atomic_files
+from cz_gym.support import files as atomic_files
 folder, names = Path(sys.argv[1]), ("a.json", "b.csv", "z.json")
 
 def killed_at(line):
