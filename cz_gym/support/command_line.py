@@ -12,9 +12,10 @@ from gymnasium.error import DependencyNotInstalled
 from .errors import CzError
 
 OPTIONAL = (
-    "aiohttp", "array_api_compat", "asyncua", "blark", "casadi", "control", "distributed", "envpool", "filelock",
-    "fmpy", "h5py", "matplotlib", "minari", "onnx", "onnxruntime", "pandas", "pcgym", "pillow", "plotly", "pyarrow",
-    "pygame", "pythonfmu", "sb3_contrib", "selenium", "stable_baselines3", "tensorboard", "torch", "torchrl", "tqdm",
+    "aiohttp", "array_api_compat", "asyncua", "blark", "casadi", "control", "cryptography", "distributed", "envpool",
+    "filelock", "fmpy", "h5py", "joblib", "matplotlib", "minari", "onnx", "onnxruntime", "pandas", "pcgym", "pillow",
+    "plotly", "pyarrow", "pygame", "pythonfmu", "sb3_contrib", "selenium", "stable_baselines3", "tensorboard", "torch",
+    "torchrl", "tqdm",
 )  # fmt: skip
 """Modules of the packages in the extras of ``pyproject.toml``."""
 OWN_EXTRA = {"distributed": "cluster", "casadi": "mpc"}

@@ -159,4 +159,4 @@ def test_every_package_of_the_extras_is_known_as_optional():
     documenting = {"sphinx", "myst_parser", "furo", "latex2mathml", "jupytext"}
     optional = project["optional-dependencies"]
     needed = {re.split(r"[^\w-]", line)[0].replace("-", "_") for extra in optional.values() for line in extra}
-    assert needed - building - documenting - {"cz_gym", "pygame_ce"} == {*OPTIONAL} - {"h5py"}
+    assert needed - building - documenting - {"cz_gym", "pygame_ce", "protobuf"} == {*OPTIONAL} - {"h5py"}
