@@ -13,7 +13,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
-from cz_gym.crystal.process import CRYSTAL, Along, along
+from cz_gym.crystal.process import CRYSTAL, LinearRecipe, linear_recipe
 from cz_gym.crystal.signals import Measured, TrueState
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.process import Process, scales, signals
@@ -81,9 +81,9 @@ class CrystalPID(MeasuredController):
         check_numbers(self, positive=("T_track",), not_negative=("cone_gain", "slow", "T_f"))
 
     @cached_property
-    def schedule(self) -> Along:
+    def schedule(self) -> LinearRecipe:
         """The linearisation along the recipe."""
-        return along(self.parameters, self.meniscus, self.lam)
+        return linear_recipe(self.parameters, self.meniscus, self.lam)
 
     def at_rest(self, seen: Any) -> CrystalPIDMemory:
         """The applied pull speed and power continue."""
@@ -208,7 +208,7 @@ class Gains(NamedTuple):
 @lru_cache(maxsize=12)
 def design(parameters: Any, meniscus: MeniscusModel, dt: float, lam: float, noise: Noise, weights: Weights) -> Gains:
     """Design filter and regulator for a control interval [s]."""
-    at = along(parameters, meniscus, lam)
+    at = linear_recipe(parameters, meniscus, lam)
     walks = noise.height * in_cones(noise.cones, at.L, parameters)
     heights = weights.height * in_cones(weights.cones, at.L, parameters)
     designs = [

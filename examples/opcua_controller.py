@@ -19,7 +19,7 @@ from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 from cz_gym.config import Config, make_config
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import CzError
-from cz_gym.tools.export.block import SETPOINTS
+from cz_gym.tools.export.block import SETPOINT_NAMES
 from cz_gym.tools.export.controllers import make_block
 from cz_gym.tools.export.shell import Runner
 from cz_gym.tools.export.text import CompiledBlock
@@ -39,7 +39,7 @@ class Controller:
         """The setpoints for the tags of a step, whose names are those of the block's inputs and settings."""
         given = tags | {"ring_time_s": tags["time_s"], "automatic": True}
         outputs, self._memory = self._runner.run(given, self._memory)
-        return [float(outputs[name][0]) for name in SETPOINTS]
+        return [float(outputs[name][0]) for name in SETPOINT_NAMES]
 
 
 async def control(controller: Controller, label: str, client: Client, steps: int) -> int:

@@ -7,7 +7,6 @@ whose ``state`` must be a NamedTuple of arrays.
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,11 +27,12 @@ from cz_gym.evaluation import user_code
 from cz_gym.physics.numerics import StateSpace
 from cz_gym.physics.plant import make_puller
 from cz_gym.puller import file as machine
-from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.errors import CzError
-from cz_gym.support.files import check_writable, write_files
+from cz_gym.support.files import write_files
 from cz_gym.tools.registry import make_controller
 from cz_gym.tools.report.tables import markdown as table
+
+from .common import StudyParser
 
 PLACES = {"camera": "ring", "v_p": "pull speed", "Q_H": "heater"}
 """Places where the loop is opened, and their names."""
@@ -77,18 +77,16 @@ def picture(name: str, dt: float, loops: dict[str, StateSpace]) -> bytes:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser("python -m studies.bode", (__doc__ or "").split("\n")[0])
+    parser = StudyParser("bode", __doc__, "runs/bode.png")
     parser.add_argument("controller", help="name of a shipped controller, or FILE.py:NAME")
     parser.add_argument("--mix", type=float, default=0.5, help="1: Model I, 0: Model II (default: %(default)s)")
-    parser.add_argument("--out", type=Path, default=Path("runs/bode.png"), help="picture (default: %(default)s)")
     parser.add_puller("the loop with its plant")
-    return parser.run(_main, arguments, "benchmark")
+    return parser.run(_main, arguments)
 
 
 def _main(given: argparse.Namespace) -> None:
     if not 0.0 <= given.mix <= 1.0:
         raise CzError(f"--mix must lie in [0, 1], not {given.mix:g}")
-    check_writable(given.out.parent)
     own = machine.chosen_puller(given.puller)
     form, puller = form_of(given.controller, own), make_puller(own.parameters, given.mix)
     heats = form.controller.C[1].any() or form.controller.D[1].any()
@@ -103,10 +101,10 @@ def _main(given: argparse.Namespace) -> None:
     print(table(heads, rows))
     if not stable:
         print("the closed loop is unstable: it has no margins")
-    zones = []
-    for name, of in HOT_ZONE.items():
-        low, high = stable_range(form.controller, form.dt, of, given.mix, own.parameters)
-        zones.append((name, f"{low:.2f}", f"{high:.2f}"))
+    ranges = {
+        name: stable_range(form.controller, form.dt, of, given.mix, own.parameters) for name, of in HOT_ZONE.items()
+    }
+    zones = [(name, f"{low:.2f}", f"{high:.2f}") for name, (low, high) in ranges.items()]
     print(table(("factor on", "stable from", "to"), zones))
     write_files({given.out: picture(given.controller, form.dt, loops)})
     print(f"wrote {given.out}")

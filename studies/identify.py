@@ -29,13 +29,14 @@ from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.puller.file import PullerFile, read_puller, write_puller
 from cz_gym.spaces import HEATER_RANGE
-from cz_gym.support.command_line import OneLineParser
-from cz_gym.support.files import check_writable, write_files
+from cz_gym.support.files import write_files
 from cz_gym.support.units import KILO, MM, PERCENT
 from cz_gym.tools.identify import Excited, Identified, identify, read_log, record_log
 from cz_gym.tools.identify.estimate import PRIOR_SD
 from cz_gym.tools.identify.moves import measure_excitation
 from cz_gym.tools.report.tables import markdown
+
+from .common import StudyParser
 
 PULLERS, CRYSTALS = 20, 20
 """Number of pullers, and of crystals of each."""
@@ -144,13 +145,10 @@ without excitation, logs that are said to tell the pull speed's path: {sum(row.p
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser("python -m studies.identify", "Identify pullers that nobody knows.")
-    parser.add_argument("--out", type=Path, default=Path("results/identify"), metavar="FOLDER", help="%(default)s")
-    return parser.run(_main, arguments, "benchmark")
+    return StudyParser("identify", __doc__, "results/identify").run(_main, arguments)
 
 
 def _main(given: argparse.Namespace) -> None:
-    check_writable(given.out)
     rows: list[Row] = []
     for number in range(PULLERS):
         rows.append(study(number, CRYSTALS))

@@ -1,11 +1,10 @@
-"""Measure the speed of the environments beside that of others: ``python -m studies.speed [--quick] [--json FILE]``.
+"""Speed of the environments, beside Pendulum-v1 of Gymnasium and EnvPool: ``python -m studies.speed [--json FILE]``.
 
 Every case is measured in turn, the round is repeated, and medians are reported, so that a machine that is busy for a
 while slows all cases alike. Steps per second count every slot's step, resets included unless a name says otherwise.
 """
 
 import argparse
-import json
 import statistics
 import sys
 import timeit
@@ -25,6 +24,8 @@ from cz_gym.env import CzEnv, CzVectorEnv
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.files import check_writable, write_files
 from cz_gym.support.names import software
+
+from .common import to_json
 
 QUICK, FULL = 3, 15
 """Rounds of a measurement."""
@@ -48,21 +49,14 @@ class Stepper(NamedTuple):
 RATIOS = {
     "scalar_vs_pendulum": ("Cz-v0 scalar", "Pendulum-v1 scalar", 1.7),
     "vector1024_vs_envpool_pendulum": ("Cz-v0 batch, measured", "EnvPool Pendulum-v1", 5.0),
-    "vector1024_vs_pcgym": ("Cz-v0 batch, measured", "pc-gym CSTR", 2000.0),
     "vector1024_vs_kernel": ("Cz-v0 batch without resets, 1 thread", "bare compiled plant and ring, 1 thread", 0.65),
-    "sb3_adapter_vs_subproc": ("SB3 adapter over the batch", "SB3 SubprocVecEnv", 100.0),
     "sb3_adapter_vs_dummy": ("SB3 adapter over the batch", "SB3 DummyVecEnv", 12.0),
     "derivatives_vs_step": ("step with derivatives", "step without derivatives", 0.125),
-    "sb3_make_vec_env_vs_pendulum": ("SB3 make_vec_env, cz_gym:Cz-v0", "SB3 make_vec_env, Pendulum-v1", 1.8),
-    "sync_vector_env_vs_pendulum": ("SyncVectorEnv, cz_gym:Cz-v0", "SyncVectorEnv, Pendulum-v1", 1.5),
-    "vector1024_vs_envpool_pendulum_one_thread": (
-        "Cz-v0 batch, measured, 1 thread", "EnvPool Pendulum-v1, 1 thread", None,
-    ),
-}  # fmt: skip
-"""Two rows, each the fastest whose name begins so, and the least ratio of their speeds that is aimed at, if any."""
+}
+"""Two rows, each the fastest whose name begins so, and the least ratio of their speeds that is aimed at."""
 
 
-def cases(quick: bool) -> dict[str, Callable[[], Any]]:
+def cases(slots: int = SLOTS, sb3_slots: int = SB3_SLOTS) -> dict[str, Callable[[], Any]]:
     """Functions that make an environment, scalar or batched, or a :class:`Stepper`, by the name of their row."""
     rows: dict[str, Callable[[], Any]] = {
         f"{name} scalar": partial(gym.make, name) for name in ("Cz-v0", "Pendulum-v1")
@@ -71,21 +65,15 @@ def cases(quick: bool) -> dict[str, Callable[[], Any]]:
         ("Cz-v0 batch, measured", our_batch),
         ("Cz-v0 batch without resets", partial(our_batch, resets=False)),
         ("bare compiled plant and ring", bare_plant),
-        ("EnvPool Pendulum-v1", _envpool),
+        ("EnvPool Pendulum-v1", envpool),
     ):
         for n in sorted({1, THREADS}):
-            rows[f"{name}, {n} thread{'s' * (n > 1)}"] = partial(make, SLOTS, n)
+            rows[f"{name}, {n} thread{'s' * (n > 1)}"] = partial(make, slots, n)
     rows["step without derivatives"] = partial(differentiable, False)
     rows["step with derivatives"] = partial(differentiable, True)
-    rows["pc-gym CSTR"] = _pcgym
-    rows["SB3 adapter over the batch"] = partial(_call, "cz_gym.sb3:make_vec_env", SB3_SLOTS)
-    for name in ("cz_gym:Cz-v0", "Pendulum-v1"):
-        rows[f"SB3 make_vec_env, {name}"] = partial(_call, "stable_baselines3.common.env_util:make_vec_env", name, 16)
-        rows[f"SyncVectorEnv, {name}"] = partial(gym.make_vec, name, num_envs=4, vectorization_mode="sync")
-    ours, kinds = partial(gym.make, "cz_gym:Cz-v0"), "stable_baselines3.common.vec_env:"
-    rows["SB3 DummyVecEnv"] = partial(_call, f"{kinds}DummyVecEnv", [ours] * SB3_SLOTS)
-    for n in (2,) if quick else (2, 16):
-        rows[f"SB3 SubprocVecEnv, {n} processes"] = partial(_call, f"{kinds}SubprocVecEnv", [ours] * n)
+    rows["SB3 adapter over the batch"] = lambda: resolve_name("cz_gym.sb3:make_vec_env")(sb3_slots)
+    ours, dummy = partial(gym.make, "cz_gym:Cz-v0"), "stable_baselines3.common.vec_env:DummyVecEnv"
+    rows["SB3 DummyVecEnv"] = lambda: resolve_name(dummy)([ours] * sb3_slots)
     rows["Cz-v0 scalar, camera"] = partial(CzEnv, "nominal", observation="camera")
     return rows
 
@@ -154,30 +142,11 @@ def differentiable(derivatives: bool) -> Stepper:
     return repeated(inner, Stepper(256, step, batch.close))
 
 
-def _envpool(num_envs: int, threads: int) -> Stepper:
-    make = resolve_name("envpool:make")
-    env = make("Pendulum-v1", env_type="gymnasium", num_envs=num_envs, num_threads=threads)
+def envpool(num_envs: int, threads: int) -> Stepper:
+    """The same number of pendulums in EnvPool, whose steps are C++."""
+    env = resolve_name("envpool:make")("Pendulum-v1", env_type="gymnasium", num_envs=num_envs, num_threads=threads)
     env.reset()
     return batched(env, num_envs)
-
-
-def _pcgym() -> Any:
-    """The CSTR of pc-gym's documentation: three states, one input, 100 steps of 0.26 min."""
-    box = {"low": np.array([0.7, 300.0, 0.8]), "high": np.array([1.0, 350.0, 0.9])}
-    return resolve_name("pcgym:make_env")(
-        {
-            "N": 100, "tsim": 26, "SP": {"Ca": [0.85] * 50 + [0.9] * 50}, "o_space": box,
-            "a_space": {"low": np.array([295.0]), "high": np.array([302.0])},
-            "x0": np.array([0.8, 330.0, 0.8]), "model": "cstr", "r_scale": {"Ca": 1e3},
-            "normalise_a": True, "normalise_o": True, "noise": True, "noise_percentage": 0.001,
-            "integration_method": "casadi",
-        }
-    )  # fmt: skip
-
-
-def _call(place: str, *arguments: Any) -> Any:
-    """Call ``module:function`` of a package that may be missing."""
-    return resolve_name(place)(*arguments)
 
 
 def measure(wanted: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, Any]:
@@ -206,7 +175,7 @@ def measure(wanted: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, A
         {"name": name, "num_envs": running[name][0].num_envs, "steps_per_s": speed} for name, speed in medians.items()
     ]
     ratios = {name: ratio(medians, *pair) for name, (*pair, _) in RATIOS.items()}
-    versions = software(("gymnasium", "numpy", "numba", "stable-baselines3", "envpool", "pcgym"))
+    versions = software(("gymnasium", "numpy", "numba", "stable-baselines3", "envpool"))
     return {"ratios": ratios, "rows": rows, "skipped": skipped, "threads": THREADS, "software": versions}
 
 
@@ -228,7 +197,7 @@ def table(result: Mapping[str, Any]) -> str:
     lines += [f"{name:44}skipped: {why}" for name, why in result["skipped"].items()] + [""]
     for name, value in result["ratios"].items():
         shown, aim = "-" if value is None else f"{value:.2f}", RATIOS[name][2]
-        lines.append(f"{name:44}{shown:>10} x" + (f"   (at least {aim:g} x)" if aim else ""))
+        lines.append(f"{name:44}{shown:>10} x   (at least {aim:g} x)")
     return "\n".join(lines)
 
 
@@ -243,10 +212,10 @@ def main(argv: list[str] | None = None) -> int:
 def _measure(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
         check_writable(arguments.json.parent)
-    result = measure(cases(arguments.quick), QUICK if arguments.quick else FULL)
+    result = measure(cases(), QUICK if arguments.quick else FULL)
     print(table(result))
     if arguments.json is not None:
-        write_files({arguments.json: (json.dumps(result, indent=1, allow_nan=False) + "\n").encode()})
+        write_files({arguments.json: to_json(result)})
 
 
 if __name__ == "__main__":

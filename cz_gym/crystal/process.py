@@ -46,7 +46,7 @@ class Extra(NamedTuple):
 
 @lru_cache(maxsize=64)
 def nominal_recipe(parameters: Any, meniscus: MeniscusModel, lam: float = 1.0) -> tuple[Any, Floats]:
-    """The constants of the design puller and its recipe's table (:class:`cz_gym.crystal.recipe.Setpoint`)."""
+    """The constants of the design puller and its recipe's table (:class:`cz_gym.crystal.recipe.RecipeRow`)."""
     with np.errstate(all="ignore"):
         p = plant.Crystal(*map(float, plant.derive(parameters, Factors(lam=lam), meniscus)))
         if not np.all(np.isfinite(p)):
@@ -68,7 +68,7 @@ def check(parameters: Any, meniscus: MeniscusModel) -> Any:
     checked = parameters._replace(**check_parameters(given)._asdict())
     check_shape(checked)
     p, table = nominal_recipe(checked._replace(**dict.fromkeys(APART, 0.0)), meniscus)
-    at = recipe.Setpoint(*table.T)
+    at = recipe.RecipeRow(*table.T)
     left = growth.M_0 - at.M_s - at.M_men
     for fails, what in (
         (left <= 0.0, f"the charge of {growth.M_0:g} kg is used up: the crystal weighs {at.M_s[-1]:.3g} kg"),
@@ -247,7 +247,7 @@ INPUTS = (*Inputs._fields, "Q_d", "dT_i")
 _POINTS = 256
 
 
-class Along(NamedTuple):
+class LinearRecipe(NamedTuple):
     """The linearisation at lengths L [m], each of shape (points, ...)."""
 
     L: Floats
@@ -278,14 +278,14 @@ class Along(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def along(parameters: Any, meniscus: MeniscusModel, lam: float = 1.0) -> Along:
+def linear_recipe(parameters: Any, meniscus: MeniscusModel, lam: float = 1.0) -> LinearRecipe:
     """Linearise the design puller along its recipe, with this share of conduction [-]."""
     p, table = nominal_recipe(parameters._replace(**dict.fromkeys(APART, 0.0)), meniscus, lam)
     lengths = np.linspace(0.0, end(p), _POINTS)
     points = [_at(float(L), table, p, meniscus) for L in lengths]
     load = float(hidden_load(0.5, p) - hidden_load(-0.5, p))
     A, B, C = (np.stack(each) for each in zip(*points, strict=True))
-    return Along(lengths, A, B, C, load)
+    return LinearRecipe(lengths, A, B, C, load)
 
 
 def _at(L: float, table: Floats, p: Any, m: MeniscusModel) -> tuple[Floats, Floats, Floats]:

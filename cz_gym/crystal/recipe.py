@@ -119,7 +119,7 @@ _NEAR = 1.0 / 64.0
 """Distance over which the meniscus height is differentiated, in rows [-]."""
 
 
-class Setpoint(NamedTuple):
+class RecipeRow(NamedTuple):
     """A row of the table: the recipe at a length, apart from shape and growth rate."""
 
     t: Any
@@ -150,7 +150,7 @@ class Setpoint(NamedTuple):
     """Heat that the melt must be given beside what heats it [W]; then the heat through the crucible's wall."""
 
 
-TABLE = (ROWS, len(Setpoint._fields))
+TABLE = (ROWS, len(RecipeRow._fields))
 _t, _v_p, _Q_H, _T_1, _T_2, _T_b, _h_c, _ring, _A_s, _M_s, _M_men, _Phi_s, _needed = range(TABLE[1])
 
 

@@ -109,7 +109,7 @@ class Pullers:
 
 
 @dataclass(frozen=True)
-class Recipe:
+class TemperatureRamp:
     """Error e(t) of the temperature recipe: a linear ramp, then constant."""
 
     rate: Range = member(NONE, Variation.RANGE, _RATE, "rate of T_1,ref")
@@ -201,7 +201,7 @@ class Scenario:
 
     name: str
     pullers: Pullers = field(default_factory=Pullers)
-    recipe: Recipe = field(default_factory=Recipe)
+    recipe: TemperatureRamp = field(default_factory=TemperatureRamp)
     drift: Drift = field(default_factory=Drift)
     interface: Interface = field(default_factory=Interface)
     reference: Reference = field(default_factory=Reference)

@@ -18,10 +18,10 @@ from .scenario import (
     Interface,
     Mixture,
     Pullers,
-    Recipe,
     Reference,
     Scenario,
     Sensor,
+    TemperatureRamp,
     make_mixture,
     read_series,
 )
@@ -43,7 +43,7 @@ NOMINAL = Scenario("nominal")
 
 PAPER_RAMP = Scenario(
     "paper-ramp",
-    recipe=Recipe(rate=(0.5 * K_PER_MIN, 0.5 * K_PER_MIN), duration=_minutes(10, 10), start=_minutes(10, 10)),
+    recipe=TemperatureRamp(rate=(0.5 * K_PER_MIN, 0.5 * K_PER_MIN), duration=_minutes(10, 10), start=_minutes(10, 10)),
 )
 
 REFERENCE_A = Scenario("reference-a", reference=replace(_FALL, amount=(-2.5 * MM, -2.5 * MM)))
@@ -52,7 +52,7 @@ REFERENCE_B = Scenario("reference-b", reference=replace(_FALL, amount=(-0.5 * MM
 RANDOMIZED = Scenario(
     "randomized",
     pullers=Pullers(mix=(0.0, 1.0), capillary=0.03, conductivity=0.1, conductance=0.1, start_radius_sd=0.2 * MM),
-    recipe=Recipe(rate=_either_way(0.5 * K_PER_MIN), duration=_minutes(5, 10), start=_minutes(10, 110)),
+    recipe=TemperatureRamp(rate=_either_way(0.5 * K_PER_MIN), duration=_minutes(5, 10), start=_minutes(10, 110)),
     drift=Drift(amount=_either_way(5.0), duration=_minutes(20, 100), start=_minutes(0, 100)),
     interface=Interface(sd=(0.0, 0.5)),
     reference=Reference(

@@ -44,7 +44,7 @@ def set_points(puller: PullerFile) -> SetPoints:
     """The recipe of a puller, a value a row of its table; CzError, with the length, for what cannot be grown."""
     config = make_config(process=CRYSTAL, puller=puller, stage="whole")
     p, table = nominal_recipe(config.parameters._replace(**dict.fromkeys(CRYSTAL.apart, 0.0)), config.meniscus)
-    at, L = recipe.Setpoint(*table.T), lengths(p)
+    at, L = recipe.RecipeRow(*table.T), lengths(p)
     inside = slice(recipe.MARGIN, recipe.ROWS - recipe.MARGIN)
     r, slope, v_g = (np.array(column) for column in zip(*(shape_at(each, p, Episode()) for each in L), strict=True))
     level = (p.M_0 - at.M_s - at.M_men) / (p.rho_l * np.pi * p.R_cr**2)

@@ -1,7 +1,6 @@
 """``python -m studies.paper --out results/paper``: Part II of the paper, redone on our plant (docs/paper.md)."""
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,10 +13,10 @@ from cz_gym.baselines.analysis import design_compensator, margins
 from cz_gym.baselines.pid import CompensatedPID
 from cz_gym.body.process import radius_model
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.support.command_line import OneLineParser
-from cz_gym.support.files import check_writable, write_files
+from cz_gym.support.files import write_files
 from cz_gym.support.units import HOUR, MM
 from cz_gym.tools.report.tables import markdown as table
+from studies.common import StudyParser, to_json
 
 from . import experiments as ex
 from .experiments import COMPENSATOR, CROSSOVER, ODE, PHASE_MARGIN_DEG, PID, PUBLISHED, ZERO
@@ -225,9 +224,7 @@ def _menisci() -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser("python -m studies.paper", "Part II of the paper, redone on our plant.")
-    parser.add_argument("--out", type=Path, default=Path("results/paper"), help="folder for the results")
-    return parser.run(_compare, arguments, "benchmark")
+    return StudyParser("paper", "Part II of the paper, redone on our plant.", "results/paper").run(_compare, arguments)
 
 
 def _compare(given: argparse.Namespace) -> None:
@@ -237,10 +234,9 @@ def _compare(given: argparse.Namespace) -> None:
 
     from .figures import FIGURES
 
-    check_writable(given.out)
     files = {"report.md": report({name: caption for name, (caption, _) in FIGURES.items()}).encode()}
     files |= {name: png(draw()) for name, (_, draw) in FIGURES.items()}
-    files["numbers.json"] = (json.dumps(numbers(), indent=2, allow_nan=False) + "\n").encode()
+    files["numbers.json"] = to_json(numbers(), indent=2)
     write_files({given.out / name: content for name, content in files.items()})
     print(comparison(rows()))
     print(f"\nreport: {given.out / 'report.md'}")

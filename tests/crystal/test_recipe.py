@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cz_gym.config import make_config
-from cz_gym.crystal.process import CRYSTAL, along, nominal_recipe
+from cz_gym.crystal.process import CRYSTAL, linear_recipe, nominal_recipe
 from cz_gym.crystal.recipe import growth_rate, shape_at
 from cz_gym.env import CzCrystalEnv
 from cz_gym.episodes.draw import Episode
@@ -116,7 +116,7 @@ def test_the_command_writes_what_an_operator_loads(tmp_path, capsys):
 
 def test_the_linearisation_along_the_recipe():
     """The ring's zero [rad/s] and its share of the height, as a prototype had them; the rates by differences."""
-    at = along(make_config(process=CRYSTAL).parameters, HURLE)
+    at = linear_recipe(make_config(process=CRYSTAL).parameters, HURLE)
     crown, body, tail = (np.argmin(np.abs(at.L - L)) for L in (0.06, 0.14, 1.18))
     np.testing.assert_allclose(at.zero[[crown, body]], [0.0034, 0.0227], rtol=0.02)
     assert at.zero[tail] < 0.0

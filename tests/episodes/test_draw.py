@@ -10,7 +10,7 @@ from scipy import stats
 
 from cz_gym import SCENARIOS, Parameters, Scenario, make_puller
 from cz_gym.episodes.draw import FREEZES, Episode, Factors, episode_from_key, factors_from_key, new_series, randomised
-from cz_gym.episodes.scenario import Actuators, Faults, Interface, Recipe, Reference, Sensor, Variation
+from cz_gym.episodes.scenario import Actuators, Faults, Interface, Reference, Sensor, TemperatureRamp, Variation
 
 MM, MINUTE, SPAN = 1e-3, 60.0, 10800.0
 WORD = st.integers(0, 2**64 - 1)
@@ -106,7 +106,7 @@ def same(one, other):
 
 BESIDE = dataclasses.replace(
     Scenario("deterministic"),
-    recipe=Recipe(duration=(50.0, 50.0)),
+    recipe=TemperatureRamp(duration=(50.0, 50.0)),
     reference=Reference(1.0, (1e-3, 1e-3), (50.0, 50.0)),
     sensor=Sensor(outlier_sd=1e-4, rotation=(0.1, 0.1)),
     faults=Faults(flagged_duration=(50.0, 50.0), unflagged_duration=(50.0, 50.0)),

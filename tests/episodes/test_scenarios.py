@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cz_gym import SCENARIOS, Scenario
-from cz_gym.episodes.scenario import Drift, Faults, Interface, Pullers, Recipe
+from cz_gym.episodes.scenario import Drift, Faults, Interface, Pullers, TemperatureRamp
 from cz_gym.episodes.scenarios import find_scenario, mix_of
 from cz_gym.evaluation.protocol import find_case
 
@@ -31,7 +31,7 @@ def test_contents_of_the_scenarios_are_frozen():
     assert {scenario.name: scenario.hash for scenario in SCENARIOS.values()} == FROZEN
     assert list(SCENARIOS) == list(FROZEN)
     with pytest.raises(dataclasses.FrozenInstanceError):
-        SCENARIOS["nominal"].recipe = Recipe()
+        SCENARIOS["nominal"].recipe = TemperatureRamp()
 
 
 @pytest.mark.parametrize(("family", "member", "default"), MEMBERS)
@@ -81,7 +81,11 @@ def test_a_number_outside_its_range_is_refused_with_a_guess_at_the_unit_that_was
 
 def test_families_of_another_kind_no_name_and_freezes_that_do_not_fit_are_refused():
     long = Faults(flagged=(3, 3), flagged_duration=(3601.0, 3601.0))
-    for arguments, said in (({"drift": Recipe()}, "a Drift"), ({"name": ""}, "name"), ({"faults": long}, "do not fit")):
+    for arguments, said in (
+        ({"drift": TemperatureRamp()}, "a Drift"),
+        ({"name": ""}, "name"),
+        ({"faults": long}, "do not fit"),
+    ):
         with pytest.raises(ValueError, match=said):
             Scenario(**{"name": "mine", **arguments})
 

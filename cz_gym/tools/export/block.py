@@ -96,7 +96,7 @@ OUTPUTS = (
     Port("alarms", "sum of the alarm bits"),
 )
 """The outputs of every block."""
-SETPOINTS = dict(zip((port.name for port in OUTPUTS), ("pull_speed_mm_per_min", "heater_power_kW"), strict=False))
+SETPOINT_NAMES = dict(zip((port.name for port in OUTPUTS), ("pull_speed_mm_per_min", "heater_power_kW"), strict=False))
 """The setpoints, and the applied drives that follow them."""
 
 

@@ -21,7 +21,7 @@ from cz_gym.spaces import decode
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
 
-from .block import INPUTS, OUTPUTS, SETPOINTS, in_plant_units, in_shares, nominal_puller
+from .block import INPUTS, OUTPUTS, SETPOINT_NAMES, in_plant_units, in_shares, nominal_puller
 from .trace import Port
 
 SCRIPT = """import ctypes
@@ -64,7 +64,7 @@ class CzPuller(Fmi2Slave):  # type: ignore[misc]
         self._begin(config)
         for port in OUTPUTS[:2]:
             self._add(Real, port.name, port.meaning, Fmi2Causality.input)
-        self._started = {name: getattr(self, name) for name in SETPOINTS}
+        self._started = {name: getattr(self, name) for name in SETPOINT_NAMES}
         for port in (*SHOWN, TRUTH, Port("growing", "false once the crystal has ended", 1.0, True)):
             discrete = Fmi2Variability.discrete if port.logical else None
             self._add(Boolean if port.logical else Real, port.name, port.meaning, Fmi2Causality.output, discrete)
@@ -82,7 +82,7 @@ class CzPuller(Fmi2Slave):  # type: ignore[misc]
         puller = nominal_puller(config)
         rest = in_plant_units(Measured(*[0.0] * len(Measured._fields)), puller)
         self.__dict__.update(rest, growing=True, **{TRUTH.name: puller.r_0 / MM})
-        self.__dict__.update({name: rest[applied] for name, applied in SETPOINTS.items()})
+        self.__dict__.update({name: rest[applied] for name, applied in SETPOINT_NAMES.items()})
 
     def to_xml(self, model_options: dict[str, str] | None = None) -> Element:
         """Return the model description with what pythonfmu leaves out: units, and the unknowns of the initial state."""
@@ -101,7 +101,7 @@ class CzPuller(Fmi2Slave):  # type: ignore[misc]
 
     def exit_initialization_mode(self) -> None:
         """Begin the crystal of the parameters; setpoints that nobody has set begin at its puller's operating point."""
-        config, given = self._config(), {name: getattr(self, name) for name in SETPOINTS}
+        config, given = self._config(), {name: getattr(self, name) for name in SETPOINT_NAMES}
         self._begin(config)
         self.__dict__.update({name: value for name, value in given.items() if value != self._started[name]})
         self.env = CzEnv.from_config(config)

@@ -31,7 +31,7 @@ from cz_gym.support.errors import CzError
 from cz_gym.support.files import check_writable, name_file_in_errors, write_files
 from cz_gym.support.names import leaves, map_arrays
 from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN
-from cz_gym.tools.export.block import INPUTS, OUTPUTS, SETPOINTS, in_plant_units, settings_of
+from cz_gym.tools.export.block import INPUTS, OUTPUTS, SETPOINT_NAMES, in_plant_units, settings_of
 from cz_gym.tools.export.controllers import FALLBACK, REGISTRY, make_block
 from cz_gym.tools.identify.log import COLUMNS
 
@@ -227,12 +227,14 @@ class Machine:
         self._fallback = self._make_fallback()
         self._memory = self._rest()
         self._fixed = self._settings()
-        self.limits = {name: [self._fixed[name.replace("setpoint", e)] for e in ("min", "max")] for name in SETPOINTS}
+        self.limits = {
+            name: [self._fixed[name.replace("setpoint", e)] for e in ("min", "max")] for name in SETPOINT_NAMES
+        }
         self._fixed |= {"control_interval_s": self.interval, "watchdog_s": watchdog, "puller": config.puller.label}
         self._fixed["scenario"] = self._record.scenario
         self.k, self.answered, self.late, self.manual, self._renewed = 0, -1, False, False, -math.inf
         self._active: list[float] = self.nominal.tolist()
-        self._pending = dict(zip(SETPOINTS, self._active, strict=True))
+        self._pending = dict(zip(SETPOINT_NAMES, self._active, strict=True))
         self.committed = threading.Condition(self._lock)
         self.hour: deque[dict[str, Any]] = deque(maxlen=int(HOUR / self.interval) + 1)
         """The tags of the last hour."""
@@ -266,7 +268,7 @@ class Machine:
         low, high = map(self._in_plant_units, ends)
         limits = {name: tuple(span) for name, span in self.limits.items()}
         spans = {name: (low[name], high[name]) for name in low if name != "valid"}
-        return spans | limits | dict(zip(SETPOINTS.values(), limits.values(), strict=True))
+        return spans | limits | dict(zip(SETPOINT_NAMES.values(), limits.values(), strict=True))
 
     def _resume(self, saved: State) -> None:
         """Go on from a saved state."""
@@ -294,7 +296,9 @@ class Machine:
         with self._lock:
             reasons = {name: reason for name, value in writes.items() if (reason := self._refusal(name, value))}
             if not reasons:
-                self._pending |= {n: float(np.clip(v, *self.limits[n])) for n, v in writes.items() if n in SETPOINTS}
+                self._pending |= {
+                    n: float(np.clip(v, *self.limits[n])) for n, v in writes.items() if n in SETPOINT_NAMES
+                }
                 if "watchdog" in writes:
                     self.answered = writes["watchdog"]
                     self._act()
@@ -318,7 +322,7 @@ class Machine:
     def _refusal(self, name: str, value: Any) -> str:
         if self.manual:
             return "the operator has control"
-        if name in SETPOINTS:
+        if name in SETPOINT_NAMES:
             low, high = self.limits[name]
             room = TOLERANCE * high
             return "" if low - room <= value <= high + room else f"outside {low:.6g} to {high:.6g}"
@@ -326,7 +330,7 @@ class Machine:
 
     def _act(self) -> None:
         """Let the stored setpoints act."""
-        self._active, self._renewed = [self._pending[name] for name in SETPOINTS], self.k
+        self._active, self._renewed = [self._pending[name] for name in SETPOINT_NAMES], self.k
 
     @property
     def control(self) -> str:
@@ -364,7 +368,7 @@ class Machine:
         """The fallback's setpoints for the step that begins now."""
         given = self.hour[-1] | {"ring_time_s": self.k * self.interval, "automatic": True}
         outputs, self._memory = self._fallback.run(given, self._memory)
-        return [float(outputs[name][0]) for name in SETPOINTS]
+        return [float(outputs[name][0]) for name in SETPOINT_NAMES]
 
     def _in_plant_units(self, seen: Any) -> dict[str, Any]:
         return in_plant_units(seen, self.puller)
@@ -381,12 +385,12 @@ class Machine:
             PullerAlarm.FALLBACK: control == "fallback", PullerAlarm.MANUAL: control == "manual",
             PullerAlarm.LATE: self.late, PullerAlarm.ENDED: ending is not None,
         }  # fmt: skip
-        values |= dict(zip(SETPOINTS, self._active, strict=True)) | {
+        values |= dict(zip(SETPOINT_NAMES, self._active, strict=True)) | {
             "time_s": self.k * self.interval, "state": "growing" if ending is None else ending.value.lower(),
             "control": control, "alarms": sum(bit for bit, holds in bits.items() if holds),
             "valid": values["valid"] > 0.5, "watchdog": max(self.answered, 0), "step": self.k,
         }  # fmt: skip
-        for applied, limits in zip(SETPOINTS.values(), self.limits.values(), strict=True):
+        for applied, limits in zip(SETPOINT_NAMES.values(), self.limits.values(), strict=True):
             values[applied] = np.clip(values[applied], *limits)  # actions are in single precision
         tags = {tag.name: tag.kind(values[tag.name]) for tag in self.tags}
         self.hour.append(tags)
@@ -485,7 +489,7 @@ class CrystalMachine(Machine):
         drives = self._record.table[:, [_v_p, _Q_H]] / (MM_PER_MIN, KILO)
         room = np.minimum(self._units, (self.config.puller.pull_room / MM_PER_MIN, np.inf))
         limits = np.maximum(drives.min(axis=0) - room, 0.0), drives.max(axis=0) + room
-        names = [name.replace("setpoint", end) for end in ("min", "max") for name in SETPOINTS]
+        names = [name.replace("setpoint", end) for end in ("min", "max") for name in SETPOINT_NAMES]
         return super()._settings() | dict(zip(names, np.ravel(limits).tolist(), strict=True))
 
     def _in_plant_units(self, seen: Any) -> dict[str, Any]:

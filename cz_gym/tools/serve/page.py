@@ -15,7 +15,7 @@ from plotly.offline import get_plotlyjs
 
 from cz_gym.rendering.canvas import load
 from cz_gym.support.errors import CzError
-from cz_gym.tools.export.block import SETPOINTS
+from cz_gym.tools.export.block import SETPOINT_NAMES
 
 from .machine import Machine, PullerAlarm
 from .opcua import Account, Door, in_address
@@ -140,7 +140,7 @@ class Page:
             given = json.loads(await request.read())
         except (ValueError, RecursionError):
             given = None
-        good = isinstance(given, dict) and set(given) in (set(), set(SETPOINTS))
+        good = isinstance(given, dict) and set(given) in (set(), set(SETPOINT_NAMES))
         if not good or not all(type(value) in (int, float) for value in given.values()):
             return web.Response(status=400, text="two numbers, or none")
         reasons = self.machine.by_hand(given)

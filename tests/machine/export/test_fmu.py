@@ -10,11 +10,11 @@ from fmpy.validation import validate_fmu
 from cz_gym import CzEnv
 from cz_gym.spaces import decode
 from cz_gym.support.units import MM
-from cz_gym.tools.export.block import SETPOINTS, in_plant_units, in_shares, nominal_puller
+from cz_gym.tools.export.block import SETPOINT_NAMES, in_plant_units, in_shares, nominal_puller
 from cz_gym.tools.export.command import main
 from cz_gym.tools.export.fmu import SHOWN, TRUTH
 
-OUTPUT = ["growing", TRUTH.name, *SETPOINTS, *SETPOINTS.values()]
+OUTPUT = ["growing", TRUTH.name, *SETPOINT_NAMES, *SETPOINT_NAMES.values()]
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def test_fmpy_grows_the_crystal_of_the_environment(own, tmp_path):
     assert shown() == expected(*env.reset(seed=7))
     for k in range(60):
         values = puller.v_0 * 6e4 * (1.0 + 0.01 * (k % 7)), puller.Q_H_0 / 1e3 + 0.02 * k
-        setpoints = dict(zip(SETPOINTS, values, strict=True))
+        setpoints = dict(zip(SETPOINT_NAMES, values, strict=True))
         unit.setReal([at[name] for name in setpoints], values)
         unit.doStep(k * dt, dt)
         observation, *_, info = env.step(in_shares(setpoints, config).clip(-1.0, 1.0))
@@ -62,7 +62,7 @@ def test_the_description_is_valid_and_says_units(unit):
     assert validate_fmu(unit) == []
     model = fmpy.read_model_description(unit)
     units = {each.name: each.unit for each in model.modelVariables if each.type == "Real"}
-    assert {units[name] for name in SETPOINTS} == {"mm/min", "kW"}
+    assert {units[name] for name in SETPOINT_NAMES} == {"mm/min", "kW"}
     assert None not in units.values()
     assert {each.name: each.baseUnit.factor for each in model.unitDefinitions} == {
         "mm": 1e-3, "mm/min": pytest.approx(1e-3 / 60.0), "K": 1.0, "kW": 1e3,

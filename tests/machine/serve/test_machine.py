@@ -11,10 +11,10 @@ from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.puller.file import PullerFile
 from cz_gym.support.errors import CzError
-from cz_gym.tools.export.block import SETPOINTS
+from cz_gym.tools.export.block import SETPOINT_NAMES
 from cz_gym.tools.serve.machine import Clock, CrystalMachine, LogFile, Machine, PullerAlarm, StateFile
 
-PULL, HEATER = SETPOINTS
+PULL, HEATER = SETPOINT_NAMES
 
 
 def machine(watchdog=60.0, log=None, state=None, **settings):
@@ -201,9 +201,9 @@ def test_setpoints_of_a_crystal_are_absolute_and_those_of_the_recipe_follow_it()
     one = CrystalMachine(config, 1, 60.0)
     for _ in range(200):
         recipe = [one.hour[-1][name] for name in ("pull_speed_recipe_mm_per_min", "heater_power_recipe_kW")]
-        assert one.offer(dict(zip(SETPOINTS, recipe, strict=True)) | {"watchdog": one.k}) == {}
+        assert one.offer(dict(zip(SETPOINT_NAMES, recipe, strict=True)) | {"watchdog": one.k}) == {}
         row = one.step()
-        assert [row[applied] for applied in SETPOINTS.values()] == pytest.approx(recipe, rel=1e-6)
+        assert [row[applied] for applied in SETPOINT_NAMES.values()] == pytest.approx(recipe, rel=1e-6)
         assert row["ring_radius_mm"] - row["ring_bias_mm"] == pytest.approx(row["r_ref_mm"], abs=0.05)
     assert one.offer({PULL: 2.0, HEATER: 50.0, "watchdog": one.k}) == {}
     row = one.step()

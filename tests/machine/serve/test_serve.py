@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cz_gym.tools.export.block import SETPOINTS
+from cz_gym.tools.export.block import SETPOINT_NAMES
 from cz_gym.tools.identify.log import read_log
 from cz_gym.tools.serve import command
 from tests.machine.serve.conftest import PASSWORD, answer, connected, free_port, running, with_client
@@ -24,7 +24,7 @@ from tests.processes import ROOT
 
 from asyncua import ua  # isort: skip
 
-PULL, HEATER = SETPOINTS
+PULL, HEATER = SETPOINT_NAMES
 
 
 @pytest.fixture(scope="module")

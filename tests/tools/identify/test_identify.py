@@ -23,7 +23,7 @@ from cz_gym.tools.identify.moves import CHIPS, SEQUENCE, measure_excitation
 from cz_gym.tools.registry import make_controller
 from studies.identify import draw, write_logs
 from tests.foreign_puller import SLOW, ForeignPuller, Operator, drive, write_log
-from tests.machine.identify.conftest import OWN, TRUTH
+from tests.tools.identify.conftest import OWN, TRUTH
 
 
 @pytest.mark.parametrize(("interval", "off"), [(5.0, 3e-4), (10.0, 3e-4)])
