@@ -132,8 +132,8 @@ class Config:
     def reward_hash(self) -> str:
         """SHA-256 of the reward: its weights, and what it computes at some points (16 hex digits)."""
         process, numbers = self.process, list[float](self.weights)
-        carried = process.carry(
-            process.Extra(*[1.0] * len(process.Extra._fields)), Inputs(2.0, 3.0), Inputs(0.0, 0.0), 60.0
+        carried = process.update_memory(
+            process.StepMemory(*[1.0] * len(process.StepMemory._fields)), Inputs(2.0, 3.0), Inputs(0.0, 0.0), 60.0
         )
         for size in (10.0**power for power in range(-6, 5)):
             terms = process.cost_terms(process.Cost(*[size] * len(process.Cost._fields)), self.weights)
@@ -253,7 +253,7 @@ def _computed(process: Process, meniscus: MeniscusModel, parameters: Parameters)
             p = process.derive(parameters, Factors(lam=lam), meniscus)
             numbers += [*p, process.hidden_load(3.0, p)]
             for x, u, d in process.points(p):
-                numbers += [*process.rates(x, u, d, p, meniscus), *process.see(x, p, meniscus)]
+                numbers += [*process.rates(x, u, d, p, meniscus), *process.perfect_readings(x, p, meniscus)]
     return tuple(numbers)
 
 

@@ -227,7 +227,7 @@ class CzEnv(EnvBase, gym.Env[Observation, Action]):
         self._over, self._begun, self._named = True, False, isinstance(config.scenario, Mixture)
         names = config.process.info
         self._names, self._clipped = names, names.index("action_clipped")
-        self._lean = tuple((name, names.index(name)) for name in config.process.Lean._fields)
+        self._lean = tuple((name, names.index(name)) for name in config.process.BriefInfo._fields)
         self._view = make_view(render_mode, render_size, self.config)
 
     def reset(
@@ -415,7 +415,7 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         self.single_observation_space = observation_space(config.observation, config.process)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        rows, lean = config.process.info, config.process.Lean._fields
+        rows, lean = config.process.info, config.process.BriefInfo._fields
         self._clipped, self._names = rows.index("action_clipped"), rows if self._everything else lean
         self._rows = tuple(map(rows.index, self._names))
         self._masks = tuple(f"_{name}" for name in self._names)

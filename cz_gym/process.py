@@ -1,24 +1,25 @@
-"""What an environment simulates: one value of :class:`Process`, which the engine compiles in.
+"""The record of functions and types that the engine compiles into an environment: :class:`Process`.
 
-Its types say which numbers there are, its functions what becomes of them. Slots, lanes, complex steps, rows of ``info``
-and channels of observations follow from the types; ``Cz-v0`` is :data:`cz_gym.body.process.BODY`.
+The types name the numbers, the functions move them. Slots, lanes, complex steps, rows of ``info`` and channels of
+observations follow from the types; ``Cz-v0`` is :data:`cz_gym.body.process.BODY`.
 
-Every process stands in a puller: two drives move it (:class:`Inputs`), a camera and a pyrometer see it (:class:`Seen`),
-a scenario disturbs it (:class:`cz_gym.episodes.draw.Episode`). All functions take SI units and are pure, but for
-``begin``, and marked :func:`cz_gym.jit.jittable`. ``p`` are the puller's constants, ``e`` is the episode, ``m``
-the meniscus model, ``t`` the time [s]. ``slot`` is a record of :func:`cz_gym.engine.slots.slot_type`, with
-``slot.puller``, ``slot.episode``, ``slot.x``, the drives and the last readings.
+Every process stands in a puller: two drives move it (:class:`Inputs`), a camera and a pyrometer read it
+(:class:`PerfectReadings`), a scenario disturbs it (:class:`cz_gym.episodes.draw.Episode`). All functions take SI units
+and are pure, but for ``begin``, and marked :func:`cz_gym.jit.jittable`. ``p`` are the puller's constants, ``e`` is the
+episode, ``m`` the meniscus model, ``t`` the time [s]. ``slot`` is a record of :func:`cz_gym.engine.slots.slot_type`,
+with ``slot.puller``, ``slot.episode``, ``slot.x``, the drives and the last readings.
 
 Another process is one more value, in a room of its own:
 
-* References that run with length: ``nominal``, ``accept``, ``charged`` and ``measure`` see the state, and the
+* References that run with length: ``nominal``, ``accept``, ``cost_inputs`` and ``measure`` read the state, and the
   derivatives of a step follow them; where ``nominal`` does, :attr:`Process.nominal_moves` is true.
 * A recipe of each reset: :attr:`Process.table` is the shape of ``slot.table``, which ``begin`` fills, with random
   numbers from ``slot.streams`` where it needs some.
-* Numbers that outlive a step, as a running mean of the pull speed: the fields of :attr:`Process.Extra` stand in the
-  slot; ``begin`` sets them, ``carry`` moves them on at every step, ``charged`` may charge them.
-* Sensors beside camera and pyrometer: ``sense`` draws their noise into such fields.
-* Constants of an episode: fields of ``Extra`` that ``begin`` draws, or new ones of ``Episode`` and of the scenario.
+* Numbers that outlive a step, as a running mean of the pull speed: the fields of :attr:`Process.StepMemory` stand in
+  the slot; ``begin`` sets them, ``update_memory`` moves them on at every step, ``cost_inputs`` may charge them.
+* Sensors beside camera and pyrometer: ``draw_sensor_noise`` draws their noise into such fields.
+* Constants of an episode: fields of ``StepMemory`` that ``begin`` draws, or new ones of ``Episode`` and of the
+  scenario.
 * Stages: numbers of the parameters, which ``derive`` hands on as constants.
 * An end with success: ``accept`` returns :data:`DONE`, which ``slot.over`` then is; a row ``succeeded`` of ``info``
   tells it to rollouts.
@@ -88,8 +89,8 @@ class Inputs(NamedTuple):
     """Heater power [W]."""
 
 
-class Seen(NamedTuple):
-    """What perfect sensors see."""
+class PerfectReadings(NamedTuple):
+    """Readings of noise-free sensors."""
 
     ring: Any
     """Radius of the bright ring [m]."""
@@ -110,14 +111,14 @@ class Readings(NamedTuple):
     """The pyrometer's [K]."""
 
 
-class NoExtra(NamedTuple):
+class NoMemory(NamedTuple):
     """No numbers besides the state."""
 
 
 @jittable
-def carry_nothing(extra: Any, u: Any, nominal: Any, interval: Any) -> Any:
-    """Nothing is carried on: a process without numbers besides the state."""
-    return extra
+def keep_memory(memory: Any, u: Any, nominal: Any, interval: Any) -> Any:
+    """Return the memory unchanged."""
+    return memory
 
 
 @jittable
@@ -152,9 +153,9 @@ class Process(NamedTuple):
     TrueState: Any
     """Channels of "state"."""
     Logged: Any
-    """Rows of ``info``; among them those of ``Lean``, ``v_p``, ``Q_H``, ``ring_offset``, ``action_clipped``, and
+    """Rows of ``info``; among them those of ``BriefInfo``, ``v_p``, ``Q_H``, ``ring_offset``, ``action_clipped``, and
     ``term_`` with each name of ``Cost``."""
-    Lean: Any
+    BriefInfo: Any
     """Rows of ``info="lean"``: the controlled quantity and its reference first."""
     Cost: Any
     """Terms of a step's cost; each depends on one number."""
@@ -168,7 +169,7 @@ class Process(NamedTuple):
     """``derive(parameters, factors, m)``: ``Constants`` at these factors of the hot zone
     (:class:`cz_gym.episodes.draw.Factors`)."""
     begin: Function
-    """``begin(slot, m)``: the first ``State``; sets ``Extra`` and the table in the slot."""
+    """``begin(slot, m)``: the first ``State``; sets ``StepMemory`` and the table in the slot."""
     nominal: Function
     """``nominal(x, slot, interval)``: the ``Inputs`` from which actions and observed drives are counted in the control
     interval [s] that begins at x."""
@@ -182,24 +183,24 @@ class Process(NamedTuple):
     accept: Function
     """``accept(slot, x, new, u, d, t, dt, limit, m)``: the state after the substep of dt [s] that ended at t, and
     :data:`GROWS`, :data:`LOST` or :data:`DONE`; ``limit`` is the largest radius error [m]."""
-    see: Function
-    """``see(x, p, m)``: :class:`Seen`; complex for a complex state."""
+    perfect_readings: Function
+    """``perfect_readings(x, p, m)``: :class:`PerfectReadings`; complex for a complex state."""
     measure: Function
-    """``measure(x, u, nominal, extra, readings, slot, t)``: ``Measured`` of state, ``Inputs``, those from which actions
-    are counted, ``Extra`` and :class:`Readings`; complex for complex ones."""
+    """``measure(x, u, nominal, memory, readings, slot, t)``: ``Measured`` of state, ``Inputs``, those from which
+    actions are counted, ``StepMemory`` and :class:`Readings`; complex for complex ones."""
     true_state: Function
     """``true_state(slot, measured, t)``: ``TrueState``."""
     logged: Function
     """``logged(slot, measured, cost, t, ring, m)``: ``Logged``."""
-    lean: Function
-    """``lean(slot, measured)``: ``Lean``."""
-    charged: Function
-    """``charged(x, u, before, extra, slot, t)``: ``Cost`` of the numbers that the terms charge, ``before`` the inputs
-    of the step before."""
+    brief_info: Function
+    """``brief_info(slot, measured)``: ``BriefInfo``."""
+    cost_inputs: Function
+    """``cost_inputs(x, u, before, memory, slot, t)``: ``Cost`` of the numbers that the terms charge; ``before`` are the
+    inputs of the step before."""
     cost_terms: Function
-    """``cost_terms(charged, weights)``: ``Cost``."""
+    """``cost_terms(cost_inputs, weights)``: ``Cost``."""
     cost_slopes: Function
-    """``cost_slopes(charged, weights)``: the derivative of each term by its own number."""
+    """``cost_slopes(cost_inputs, weights)``: the derivative of each term by its own number."""
     reward: Function
     """``reward(cost, grows)``: the reward of a step [-], whose cost is ``Cost``; false if the crystal is lost in it."""
     points: Function
@@ -207,12 +208,13 @@ class Process(NamedTuple):
     (:attr:`cz_gym.config.Config.plant_hash`)."""
     weights: Any
     """The usual weights of the cost's terms, a named tuple of numbers."""
-    Extra: Any = NoExtra
+    StepMemory: Any = NoMemory
     """Numbers of a slot that outlive a step."""
-    carry: Function = carry_nothing
-    """``carry(extra, u, nominal, interval)``: ``Extra`` after the drives have moved to u, counted from ``nominal``."""
-    sense: Function = no_sensors
-    """``sense(slot)``: writes a sample of sensors of its own into ``Extra``, with random numbers from
+    update_memory: Function = keep_memory
+    """``update_memory(memory, u, nominal, interval)``: ``StepMemory`` after the drives have moved to u, counted from
+    ``nominal``."""
+    draw_sensor_noise: Function = no_sensors
+    """``draw_sensor_noise(slot)``: writes a sample of sensors of its own into ``StepMemory``, with random numbers from
     ``slot.streams``."""
     nominal_moves: bool = False
     """Whether ``nominal`` depends on the state."""
@@ -249,7 +251,7 @@ class Process(NamedTuple):
         return tuple(signals(self.TrueState).values())
 
     @property
-    def remembered(self) -> tuple[int, ...]:
+    def past_at(self) -> tuple[int, ...]:
         """Places in "measured" of the signals in ``past``."""
         return tuple(self.Measured._fields.index(each.name) for each in self.past)
 
@@ -281,7 +283,7 @@ class Process(NamedTuple):
     @property
     def integrated_scale(self) -> float:
         """Scale of the signal that "history" integrates [its unit]."""
-        return self.measured[self.remembered[0]].scale
+        return self.measured[self.past_at[0]].scale
 
 
 @cache

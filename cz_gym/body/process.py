@@ -24,7 +24,7 @@ from cz_gym.physics.plant import (
     within_limits,
 )
 from cz_gym.physics.schedule import bias_offset, melt_left, reference
-from cz_gym.process import GROWS, LOST, Inputs, Process, Seen
+from cz_gym.process import GROWS, LOST, Inputs, PerfectReadings, Process
 from cz_gym.support.units import MM
 
 from . import signals
@@ -35,7 +35,7 @@ _LOW = 5.0 * MM
 _JUMP = HEIGHT_MIN
 
 
-class Extra(NamedTuple):
+class StepMemory(NamedTuple):
     """Numbers besides the state that outlive a step."""
 
     v_p_mean: Any
@@ -117,11 +117,11 @@ def accept_substep(
 
 
 @jittable
-def see(x: Any, p: Any, m: Any) -> Any:
+def perfect_readings(x: Any, p: Any, m: Any) -> Any:
     """The bright ring around the crystal, with and without the operator's bias, and the heater."""
     h_c = height_inside(x.h_c, p)
     ring = x.r_c + m.ring_offset(x.r_c, h_c, p)
-    return Seen(ring, ring - p.ring_bias, h_c, x.T_1)
+    return PerfectReadings(ring, ring - p.ring_bias, h_c, x.T_1)
 
 
 @jittable
@@ -134,23 +134,23 @@ def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, m: Any) -> An
 
 
 @jittable
-def lean(slot: Any, measured: Any) -> Any:
+def brief_info(slot: Any, measured: Any) -> Any:
     """True radius, its reference, and whether the crystal is out of tolerance."""
-    return signals.Lean(slot.x.r_c, slot.puller.r_0 + measured.r_ref, signals.out_of_tolerance(slot, measured))
+    return signals.BriefInfo(slot.x.r_c, slot.puller.r_0 + measured.r_ref, signals.out_of_tolerance(slot, measured))
 
 
 @jittable
-def carry(extra: Any, u: Any, nominal: Any, interval: Any) -> Any:
+def update_memory(memory: Any, u: Any, nominal: Any, interval: Any) -> Any:
     """The mean pull speed after an interval."""
-    return Extra(cost.moved_mean(extra.v_p_mean, u.v_p, interval))
+    return StepMemory(cost.moved_mean(memory.v_p_mean, u.v_p, interval))
 
 
 @jittable
-def charged(x: Any, u: Any, before: Any, extra: Any, slot: Any, t: Any) -> Any:
+def cost_inputs(x: Any, u: Any, before: Any, memory: Any, slot: Any, t: Any) -> Any:
     """True radius error less what no sensor shows [m], mean pull speed above nominal [-], steps of both drives."""
     p, e = slot.puller, slot.episode
     error = x.r_c - p.r_0 - reference(t, e) + bias_offset(t, e)
-    return cost.Cost(error, extra.v_p_mean / p.v_0 - 1.0, u.v_p - before.v_p, u.Q_H - before.Q_H)
+    return cost.Cost(error, memory.v_p_mean / p.v_0 - 1.0, u.v_p - before.v_p, u.Q_H - before.Q_H)
 
 
 def points(p: Puller) -> list[tuple[State, Inputs, Disturbance]]:
@@ -173,7 +173,7 @@ BODY = Process(
     Measured=signals.Measured,
     TrueState=signals.TrueState,
     Logged=signals.Logged,
-    Lean=signals.Lean,
+    BriefInfo=signals.BriefInfo,
     Cost=cost.Cost,
     past=signals.PAST,
     relative=signals.RELATIVE,
@@ -185,19 +185,19 @@ BODY = Process(
     disturb=disturb,
     rates=rates,
     accept=accept,
-    see=see,
+    perfect_readings=perfect_readings,
     measure=signals.measure,
     true_state=signals.true_state,
     logged=logged,
-    lean=lean,
-    charged=charged,
+    brief_info=brief_info,
+    cost_inputs=cost_inputs,
     cost_terms=cost.cost_terms,
     cost_slopes=cost.cost_slopes,
     reward=cost.reward,
     points=points,
     weights=cost.WEIGHTS,
-    Extra=Extra,
-    carry=carry,
+    StepMemory=StepMemory,
+    update_memory=update_memory,
     name="Cz-v0",
 )
 

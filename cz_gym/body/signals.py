@@ -163,7 +163,7 @@ class Measured(NamedTuple):
 
 
 @jittable
-def measure(x: Any, u: Any, nominal: Any, extra: Any, readings: Any, slot: Any, t: Any) -> Any:
+def measure(x: Any, u: Any, nominal: Any, memory: Any, readings: Any, slot: Any, t: Any) -> Any:
     """:class:`Measured` of a slot at its sample's time t [s]."""
     p, e = slot.puller, slot.episode
     r_ref = reference(t, e)
@@ -179,7 +179,7 @@ def measure(x: Any, u: Any, nominal: Any, extra: Any, readings: Any, slot: Any, 
         T_1=readings.T_1 - p.T_1_0,
         v_p=u.v_p - p.v_0,
         Q_H=u.Q_H - p.Q_H_0,
-        v_p_mean=extra.v_p_mean - p.v_0,
+        v_p_mean=memory.v_p_mean - p.v_0,
     )
 
 
@@ -297,7 +297,7 @@ def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, at_interface:
     )
 
 
-class Lean(NamedTuple):
+class BriefInfo(NamedTuple):
     """The entries of ``info="lean"``; libraries copy info key by key, which costs more than the step."""
 
     r_c: Any

@@ -169,15 +169,15 @@ def picture(r_c: float, h_c: float, puller: Puller, view: View) -> npt.NDArray[n
 
 
 @lru_cache(maxsize=8)
-def build_look(meniscus: MeniscusModel = HURLE) -> Any:
-    """Compile ``look(slots, active, view, images, start, stop)``: the images of the active slots.
+def build_render(meniscus: MeniscusModel = HURLE) -> Any:
+    """Compile ``render(slots, active, view, images, start, stop)``: the images of the active slots.
 
     A slot's image shows the crystal whose bright ring is at the last reading, errors included, on the meniscus of that
     moment. It is black while the reading is flagged invalid. ``images``: uint8 of shape (n, ROWS, COLUMNS, 1).
     """
     ring_offset = meniscus.ring_offset
 
-    def look(slots: Any, active: Any, view: Any, images: Any, start: int, stop: int) -> None:
+    def render(slots: Any, active: Any, view: Any, images: Any, start: int, stop: int) -> None:
         stream = np.zeros(WORDS, np.uint64)
         for i in range(start, stop):
             if not active[i]:
@@ -195,7 +195,7 @@ def build_look(meniscus: MeniscusModel = HURLE) -> Any:
             noisy = slot.episode.camera_sd > 0.0
             expose(make_scene(r_c, slot.h_seen, p), view, noisy, stream, image)
 
-    return kernel(look, hashed(*meniscus.functions))
+    return kernel(render, hashed(*meniscus.functions))
 
 
 # Detector of the bright ring in an image, which returns the crystal's radius.

@@ -99,7 +99,7 @@ def parts(q: Any) -> tuple[Parameters, CrystalRecipe]:
 # :mod:`cz_gym.physics.plant`.
 
 
-class State(NamedTuple):
+class CrystalState(NamedTuple):
     """Plant state x."""
 
     r_c: Any
@@ -258,7 +258,7 @@ def rates(x: Any, u: Any, d: Any, p: Any, m: Any) -> Any:
     M_s_dot = p.rho_s * math.pi * x.r_c * x.r_c * at.v_g
     left = p.M_0 - x.M_s
     leaves = p.C_b / p.M_0 * (x.T_b - p.T_m) * M_s_dot
-    return State(
+    return CrystalState(
         at.v_g * at.tan_alpha,
         u.v_p - at.v_g,
         heat.heater,

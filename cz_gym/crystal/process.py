@@ -17,13 +17,24 @@ from cz_gym.physics.numerics import linearise
 from cz_gym.physics.parameters import check_parameters
 from cz_gym.physics.plant import HEIGHT_MAX_IN_A, hidden_load
 from cz_gym.physics.schedule import DRAW_SPAN, bias_offset
-from cz_gym.process import NO_OPERATING_POINT, Inputs, Process, Seen
+from cz_gym.process import NO_OPERATING_POINT, Inputs, PerfectReadings, Process
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import KILO, MM
 
 from . import plant, recipe, signals
 from . import recipe as task
-from .plant import APART, NO_DISTURBANCE, STAGES, Disturbance, State, at_interface, check_shape, complete, parts, rates
+from .plant import (
+    APART,
+    NO_DISTURBANCE,
+    STAGES,
+    CrystalState,
+    Disturbance,
+    at_interface,
+    check_shape,
+    complete,
+    parts,
+    rates,
+)
 from .recipe import end, growth_rate, shape_at
 from .signals import weight
 
@@ -33,7 +44,7 @@ _START = int(Stream.START)
 Floats = npt.NDArray[np.float64]
 
 
-class Extra(NamedTuple):
+class StepMemory(NamedTuple):
     """Numbers besides the state that outlive a step."""
 
     v_p_mean: Any
@@ -109,7 +120,7 @@ def begin(slot: Any, m: Any) -> Any:
     slot.stop, slot.v_p_mean = stop, 0.0
     task.stretch(slot, (task.time_at(stop, table, p) - task.time_at(start, table, p)) / DRAW_SPAN)
     x = recipe.state_at(start, table, p, slot.episode)
-    return State(x.r_c + slot.episode.r_c_start, x.h_c, x.T_1, x.T_2, x.T_b, x.L, x.A_s, x.M_s, x.N)
+    return CrystalState(x.r_c + slot.episode.r_c_start, x.h_c, x.T_1, x.T_2, x.T_b, x.L, x.A_s, x.M_s, x.N)
 
 
 @jittable
@@ -129,25 +140,25 @@ def disturb(Q_d: Any, dT_i: Any, t: Any, e: Any) -> Any:
 
 
 @jittable
-def see(x: Any, p: Any, m: Any) -> Any:
+def perfect_readings(x: Any, p: Any, m: Any) -> Any:
     """The bright ring around the crystal and the heater; the recipe's ring is subtracted later, at the length grown."""
     h_c = task.height_inside(x.h_c, p)
     ring = x.r_c + m.ring_offset(x.r_c, h_c, p)
-    return Seen(ring, ring, h_c, x.T_1)
+    return PerfectReadings(ring, ring, h_c, x.T_1)
 
 
 @jittable
 def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, m: Any) -> Any:
     """The rows of ``info``, growth taken at a height within the limits."""
     p, x = slot.puller, slot.x
-    at = State(x.r_c, task.height_inside(x.h_c, p), x.T_1, x.T_2, x.T_b, x.L, x.A_s, x.M_s, x.N)
+    at = CrystalState(x.r_c, task.height_inside(x.h_c, p), x.T_1, x.T_2, x.T_b, x.L, x.A_s, x.M_s, x.N)
     return signals.logged(slot, measured, cost, t, ring, at_interface(at, Disturbance(slot.Q_d, slot.dT_i), p, m.slope))
 
 
 @jittable
-def lean(slot: Any, measured: Any) -> Any:
+def brief_info(slot: Any, measured: Any) -> Any:
     """True radius, its reference, whether the crystal is out of tolerance, and whether it is long enough."""
-    return signals.Lean(
+    return signals.BriefInfo(
         slot.x.r_c,
         slot.puller.r_0 + measured.r_ref,
         signals.out_of_tolerance(slot, measured),
@@ -156,32 +167,33 @@ def lean(slot: Any, measured: Any) -> Any:
 
 
 @jittable
-def carry(extra: Any, u: Any, nominal: Any, interval: Any) -> Any:
+def update_memory(memory: Any, u: Any, nominal: Any, interval: Any) -> Any:
     """The mean pull speed above the recipe's after an interval."""
-    return Extra(cost.moved_mean(extra.v_p_mean, u.v_p - nominal.v_p, interval), extra.stop, 0.0 * extra.load_cell)
+    mean = cost.moved_mean(memory.v_p_mean, u.v_p - nominal.v_p, interval)
+    return StepMemory(mean, memory.stop, 0.0 * memory.load_cell)
 
 
 @jittable
-def sense(slot: Any) -> None:
+def draw_load_cell_noise(slot: Any) -> None:
     """The load cell's noise, from the stream of the episode's start, which nothing else draws from once it runs."""
     slot.load_cell = signals.LOAD_CELL_NOISE * slot.episode.camera_sd * normal(slot.streams[_START])
 
 
 @jittable
-def charged(x: Any, u: Any, before: Any, extra: Any, slot: Any, t: Any) -> Any:
+def cost_inputs(x: Any, u: Any, before: Any, memory: Any, slot: Any, t: Any) -> Any:
     """True radius error less what no sensor shows [m], mean pull speed above the recipe's, steps of both drives."""
     p, e = slot.puller, slot.episode
     error = x.r_c - shape_at(x.L, p, e).r + bias_offset(t, e)
-    return cost.Cost(error, extra.v_p_mean / p.v_0, u.v_p - before.v_p, u.Q_H - before.Q_H)
+    return cost.Cost(error, memory.v_p_mean / p.v_0, u.v_p - before.v_p, u.Q_H - before.Q_H)
 
 
-def points(p: Any) -> list[tuple[State, Inputs, Disturbance]]:
+def points(p: Any) -> list[tuple[CrystalState, Inputs, Disturbance]]:
     """Crystals off the body's operating point, at four lengths, with drives and disturbances off nominal."""
     sides = ((0.15, 0.8, 0.0, 9.0), (0.7, 0.4, 0.2, 4.0), (1.02, 0.9, 0.5, -3.0), (0.5, 1.2, 0.9, 6.0))
     return [
         (
-            State(wide * p.r_0, high * p.h_0, p.T_1_0 + warm, p.T_2_0 + warm, p.T_b_0 + 0.2 * warm, share * task.end(p),
-                  0.02 + share, 0.7 * share * p.M_0, 1.0 - 0.6 * share),
+            CrystalState(wide * p.r_0, high * p.h_0, p.T_1_0 + warm, p.T_2_0 + warm, p.T_b_0 + 0.2 * warm,
+                         share * task.end(p), 0.02 + share, 0.7 * share * p.M_0, 1.0 - 0.6 * share),
             Inputs(wide * p.v_0, high * p.Q_H_0),
             Disturbance(100.0 * warm, 0.1 * warm),
         )
@@ -191,12 +203,12 @@ def points(p: Any) -> list[tuple[State, Inputs, Disturbance]]:
 
 CRYSTAL = Process(
     Constants=plant.Crystal,
-    State=State,
+    State=CrystalState,
     Disturbance=Disturbance,
     Measured=signals.Measured,
     TrueState=signals.TrueState,
     Logged=signals.Logged,
-    Lean=signals.Lean,
+    BriefInfo=signals.BriefInfo,
     Cost=cost.Cost,
     past=signals.PAST,
     relative=signals.RELATIVE,
@@ -208,20 +220,20 @@ CRYSTAL = Process(
     disturb=disturb,
     rates=plant.rates,
     accept=task.accept,
-    see=see,
+    perfect_readings=perfect_readings,
     measure=signals.measure,
     true_state=signals.true_state,
     logged=logged,
-    lean=lean,
-    charged=charged,
+    brief_info=brief_info,
+    cost_inputs=cost_inputs,
     cost_terms=cost.cost_terms,
     cost_slopes=cost.cost_slopes,
     reward=cost.reward,
     points=points,
     weights=cost.WEIGHTS,
-    Extra=Extra,
-    carry=carry,
-    sense=sense,
+    StepMemory=StepMemory,
+    update_memory=update_memory,
+    draw_sensor_noise=draw_load_cell_noise,
     nominal_moves=True,
     name="CzCrystal-v0",
     table=recipe.TABLE,
@@ -238,10 +250,10 @@ ENVIRONMENTS = {each.name: each for each in (BODY, CRYSTAL)}
 # The references run with the length, so a deviation is that from the recipe at the length that has been reached. With
 # L as clock, x' = f(x, u) and L' = v_g(x), it moves by A = df/dx - (f / v_g) dv_g/dx at the recipe, and so does B.
 
-STATES = (*State._fields[:5], "M_s")
+STATES = (*CrystalState._fields[:5], "M_s")
 """Rows and columns of A: what changes within minutes, and the mass, which a load cell weighs; area and dopant are the
 recipe's."""
-_ROWS = [State._fields.index(name) for name in STATES]
+_ROWS = [CrystalState._fields.index(name) for name in STATES]
 INPUTS = (*Inputs._fields, "Q_d", "dT_i")
 """Columns of B."""
 _POINTS = 256
@@ -291,14 +303,14 @@ def linear_recipe(parameters: Any, meniscus: MeniscusModel, lam: float = 1.0) ->
 def _at(L: float, table: Floats, p: Any, m: MeniscusModel) -> tuple[Floats, Floats, Floats]:
     """A, B and C at a length."""
     row, share = recipe.place(L, p)
-    x = State(*map(float, recipe.state_at(L, table, p, Episode())))
+    x = CrystalState(*map(float, recipe.state_at(L, table, p, Episode())))
     u = Inputs(*(float(recipe.look_up(table, row, share, at)) for at in (recipe._v_p, recipe._Q_H)))
 
     def seen(x: Any, u: Any, d: Any) -> Any:
         return x.r_c + m.ring_offset(x.r_c, x.h_c, p), weight(x, 0.0, p)
 
     model = linearise(CRYSTAL, p, m, (x, u, NO_DISTURBANCE), INPUTS[2:], seen)
-    moves, length = np.array(rates(x, u, NO_DISTURBANCE, p, m)), State._fields.index("L")
+    moves, length = np.array(rates(x, u, NO_DISTURBANCE, p, m)), CrystalState._fields.index("L")
     drift = moves / moves[length]
     A, B = model.A - np.outer(drift, model.A[length]), model.B - np.outer(drift, model.B[length])
     return A[np.ix_(_ROWS, _ROWS)], B[_ROWS], model.C[:, _ROWS]

@@ -17,7 +17,7 @@ from cz_gym.physics.schedule import DRAW_SPAN, quintic
 from cz_gym.process import DONE, GROWS, LOST
 from cz_gym.support.units import HOUR, MM
 
-from .plant import State, at_interface, crystal_flux, depth, meniscus_mass, wall
+from .plant import CrystalState, at_interface, crystal_flux, depth, meniscus_mass, wall
 
 _OPENS, _ROUNDS = 40.0 / 90.0, 20.0 / 90.0
 """Shares of the crown over which its slope rises and falls."""
@@ -271,7 +271,7 @@ def state_at(L: Any, table: Any, p: Any, e: Any) -> Any:
     """The state of a crystal that has followed the recipe to a length."""
     row, share = place(L, p)
     M_s = look_up(table, row, share, _M_s)
-    return State(
+    return CrystalState(
         shape_at(L, p, e).r,
         look_up(table, row, share, _h_c),
         look_up(table, row, share, _T_1),
@@ -424,6 +424,6 @@ def accept(slot: Any, x: Any, new: Any, u: Any, d: Any, t: Any, dt: Any, limit: 
     if inside and x.h_c < _LOW:
         grows = x.h_c + 0.5 * dt * (u.v_p - at_interface(x, d, p, m.slope).v_g) >= HEIGHT_MIN
     if not grows and (inside or not (np.abs(new.r_c - x.r_c) < _JUMP and np.abs(new.h_c - x.h_c) < _JUMP)):
-        new = labelled(State, x)
+        new = labelled(CrystalState, x)
     long_enough = DONE if slot.stop <= new.L else GROWS
     return new, (long_enough if grows else LOST)

@@ -90,7 +90,7 @@ class Measured(NamedTuple):
 
 
 @jittable
-def measure(x: Any, u: Any, nominal: Any, extra: Any, readings: Any, slot: Any, t: Any) -> Any:
+def measure(x: Any, u: Any, nominal: Any, memory: Any, readings: Any, slot: Any, t: Any) -> Any:
     """:class:`Measured` of a slot at its sample's time t [s]."""
     p, e, L = slot.puller, slot.episode, x.L
     near, far = later(L, NEAR, p), later(L, FAR, p)
@@ -107,12 +107,12 @@ def measure(x: Any, u: Any, nominal: Any, extra: Any, readings: Any, slot: Any, 
         T_1=readings.T_1 - p.T_1_0,
         v_p=u.v_p - nominal.v_p,
         Q_H=u.Q_H - nominal.Q_H,
-        v_p_mean=extra.v_p_mean,
+        v_p_mean=memory.v_p_mean,
         alpha_ref=np.arctan(now.slope),
         L=L,
         v_p_ref=nominal.v_p - p.v_0,
         Q_H_ref=nominal.Q_H - p.Q_H_0,
-        weight=weight(x, extra.load_cell, p) - p.g * (value(L, slot, recipe._M_s) + value(L, slot, recipe._M_men)),
+        weight=weight(x, memory.load_cell, p) - p.g * (value(L, slot, recipe._M_s) + value(L, slot, recipe._M_men)),
     )
 
 
@@ -274,7 +274,7 @@ def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, at: Any) -> A
     )
 
 
-class Lean(NamedTuple):
+class BriefInfo(NamedTuple):
     """The entries of ``info="lean"``."""
 
     r_c: Any

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.utils import seeding
 
-from cz_gym.camera.image import build_look
+from cz_gym.camera.image import build_render
 from cz_gym.camera.view import IMAGE, make_view
 from cz_gym.config import Config, Identity
 from cz_gym.episodes.adapt import adapt_scenario
@@ -26,7 +26,7 @@ from cz_gym.spaces import drives_of, lags, observations
 from cz_gym.support.errors import CzError
 
 from .kernels import build_kernels
-from .slots import BufferPool, Fixed, ObservationScales, Out, SlotMemory, info_width, slot_type
+from .slots import BatchConstants, BufferPool, ObservationScales, Out, SlotMemory, info_width, slot_type
 
 
 def processors() -> int:
@@ -87,7 +87,9 @@ class Batch:
         self.kernels = build_kernels(process, config.meniscus)
         points = math.ceil(config.horizon / GRID) + 1
         series = series_table(config.scenario.scenarios)
-        self.fixed = Fixed(config.control_interval, config.steps, points, config.radius_limit, config.weights, series)
+        self.fixed = BatchConstants(
+            config.control_interval, config.steps, points, config.radius_limit, config.weights, series
+        )
         self.drives = drives_of(config.action, config.control_interval, *config.ranges[::-1])
         self.channels = len(observations(process)["history" if config.observation == "history" else "measured"])
         shows_state = config.observation == "state" or (everything and config.observation == "history")
@@ -127,7 +129,7 @@ class Batch:
         if self._camera:
             self._view = make_view(config.camera)
             seen = (self.memory.slots, self._all, self._view, out.image, 0, 1)
-            self._look = entry(build_look(config.meniscus), seen)
+            self._images_of = entry(build_render(config.meniscus), seen)
         self._pool: ThreadPoolExecutor | None = None
         self._owner = os.getpid()
 
@@ -158,17 +160,17 @@ class Batch:
         if not self._camera:
             return step
 
-        def step_and_look() -> None:
+        def step_and_render() -> None:
             step()
-            self._photograph(out, self._all)
+            self._render(out, self._all)
 
-        return step_and_look
+        return step_and_render
 
-    def _photograph(self, out: Out, active: npt.NDArray[np.bool_]) -> None:
+    def _render(self, out: Out, active: npt.NDArray[np.bool_]) -> None:
         """Write the images of the active slots, where images are observed."""
         if self._camera:
             arguments = (self.memory.slots, active, self._view, out.image)
-            self._run(self._look, arguments, self.num_envs, 1)
+            self._run(self._images_of, arguments, self.num_envs, 1)
 
     def reset(self, which: Sequence[int], keys: Iterable[Key], out: Out, given: Distribution | None = None) -> None:
         """Draw new episodes for the slots ``which`` and write their first sample into ``out``.
@@ -190,7 +192,7 @@ class Batch:
         for i in which:
             self.scenarios[i] = members[self._drawn.item(i)].name
         if self._camera:
-            self._photograph(out, np.isin(np.arange(self.num_envs), slots))
+            self._render(out, np.isin(np.arange(self.num_envs), slots))
 
     def _drawing(self, which: Any, keys: Any, lots: ScenarioTable, out: Out) -> tuple[Any, ...]:
         """Arguments of the compiled draw, without the range of slots."""
@@ -206,7 +208,7 @@ class Batch:
         active = self._all if active is None else active
         arguments = (self.memory, self.actions, active, self.fixed, self.drives, self.scales, out)
         ended: int = sum(self._run(self._step, arguments, self.num_envs, SLOTS_PER_THREAD, SLOTS_AT_ONCE))
-        self._photograph(out, active)
+        self._render(out, active)
         return ended
 
     def advance(self, rings: npt.NDArray[np.float64]) -> None:
@@ -268,7 +270,7 @@ class Batch:
             self.scenarios[i] = state.scenario
         self.kernels.show(self.memory, np.array(which, np.int64), self.fixed, self.scales, out, 0, len(which))
         if self._camera:
-            self._photograph(out, np.isin(np.arange(self.num_envs), which))
+            self._render(out, np.isin(np.arange(self.num_envs), which))
 
     def _saved(self) -> tuple[npt.NDArray[Any], ...]:
         memory = self.memory

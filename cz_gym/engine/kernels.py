@@ -20,7 +20,7 @@ from cz_gym.physics.numerics import along, clip
 from cz_gym.process import GROWS, LOST, Inputs, Process, Readings
 from cz_gym.spaces import CLIP, INTEGRAL_SCALE
 
-from .loop import LANES, advance, drive, sense
+from .loop import LANES, advance, drive, sample_sensors
 from .slots import model_of
 
 
@@ -32,25 +32,25 @@ def write_channels(values: Any, per_scale: Any, out: Any) -> None:
 
 
 @jittable
-def remember(slot: Any, history: Any, interval: Any, out: Any, process: Any) -> None:
+def update_history(slot: Any, history: Any, interval: Any, out: Any, process: Any) -> None:
     """Add the sample's scaled channels to the running sums, and the first of them, the error, to its integral."""
-    depth, error = history.shape[0], process.remembered[0]
+    depth, error = history.shape[0], process.past_at[0]
     if slot.k == 0:
         for back in range(depth):
             history[depth - 1 - back, 0] = -out[error] * back
-            for channel in range(1, len(process.remembered)):
+            for channel in range(1, len(process.past_at)):
                 history[depth - 1 - back, channel] = 0.0
     else:
         step = out[error] * (process.integrated_scale / INTEGRAL_SCALE) * interval
         slot.integral = clip(slot.integral + step, CLIP)
     at = slot.k % depth
     before = at - 1 if at > 0 else depth - 1
-    for channel in range(len(process.remembered)):
-        history[at, channel] = history[before, channel] + out[process.remembered[channel]]
+    for channel in range(len(process.past_at)):
+        history[at, channel] = history[before, channel] + out[process.past_at[channel]]
 
 
 @jittable
-def recall(slot: Any, measured: Any, history: Any, scales: Any, out: Any, process: Any) -> None:
+def write_history(slot: Any, measured: Any, history: Any, scales: Any, out: Any, process: Any) -> None:
     """Turn "measured" channels into "history": integral, differences of successive spans' means, relative channels."""
     depth, first, signals = history.shape[0], len(measured), process.lagged
     later, at = scratch(1, process.lagged), slot.k % depth
@@ -102,23 +102,24 @@ def _sample(memory: Any, i: Any, fresh: Any, fixed: Any, scales: Any, out: Any, 
     """Read the sensors of slot i if ``fresh``, write observation and info, and return the terms of the step's cost."""
     process, slot = model.process, memory.slots[i]
     t, x = slot.k * fixed.interval, labelled(process.State, slot.x)
-    seen = process.see(x, slot.puller, model.meniscus)
+    seen = process.perfect_readings(x, slot.puller, model.meniscus)
     if fresh:
         camera, pyrometer = sample_noise(slot.episode, slot.streams)
-        sense(slot, camera, pyrometer, memory.frames[i], t, seen)
-        process.sense(slot)
-    u, before, extra = labelled(Inputs, slot), Inputs(slot.v_p_before, slot.Q_H_before), labelled(process.Extra, slot)
+        sample_sensors(slot, camera, pyrometer, memory.frames[i], t, seen)
+        process.draw_sensor_noise(slot)
+    u, before = labelled(Inputs, slot), Inputs(slot.v_p_before, slot.Q_H_before)
+    step_memory = labelled(process.StepMemory, slot)
     nominal = Inputs(slot.v_p_nominal, slot.Q_H_nominal)
-    measured = process.measure(x, u, nominal, extra, labelled(Readings, slot), slot, t)
+    measured = process.measure(x, u, nominal, step_memory, labelled(Readings, slot), slot, t)
     row = out.observation[i]
     write_channels(measured, scales.measured, row)
     if memory.history.shape[1] > 0:
         if fresh:
-            remember(slot, memory.history[i], fixed.interval, row, process)
-        recall(slot, measured, memory.history[i], scales, row, process)
+            update_history(slot, memory.history[i], fixed.interval, row, process)
+        write_history(slot, measured, memory.history[i], scales, row, process)
     if out.state.shape[1] > 0:
         write_channels(process.true_state(slot, measured, t), scales.state, out.state[i])
-    cost = process.cost_terms(process.charged(x, u, before, extra, slot, t), fixed.weights)
+    cost = process.cost_terms(process.cost_inputs(x, u, before, step_memory, slot, t), fixed.weights)
     if slot.k == 0:
         cost = along(cost, -1.0, cost)
     if scales.everything:
@@ -126,10 +127,10 @@ def _sample(memory: Any, i: Any, fresh: Any, fixed: Any, scales: Any, out: Any, 
         for entry in range(len(logged)):
             out.info[entry, i] = logged[entry]
     else:
-        lean = process.lean(slot, measured)
-        for entry in range(len(lean)):
-            out.info[model.lean_rows[entry], i] = lean[entry]
-        out.info[model.lean_rows[len(lean)], i] = slot.clipped
+        brief = process.brief_info(slot, measured)
+        for entry in range(len(brief)):
+            out.info[model.brief_rows[entry], i] = brief[entry]
+        out.info[model.brief_rows[len(brief)], i] = slot.clipped
     return cost
 
 
@@ -262,7 +263,7 @@ def build_kernels(process: Process, meniscus: MeniscusModel) -> Kernels:
             for i in range(first, first + count):
                 _fetch_slot(memory.numbers, i + LANES, model)
                 x = labelled(process.State, memory.slots[i].x)
-                rings[i] = process.see(x, memory.slots[i].puller, meniscus).ring
+                rings[i] = process.perfect_readings(x, memory.slots[i].puller, meniscus).ring
 
     keep = hashed(*process.functions, *meniscus.functions)
     return Kernels(

@@ -55,8 +55,8 @@ def drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any, process: 
     if e.heater_step > 0.0:
         whole = nominal.Q_H + e.heater_step * np.rint((slot.Q_H_slewed - nominal.Q_H) / e.heater_step)
         slot.Q_H = np.maximum(whole, 0.0)
-    extra = process.carry(labelled(process.Extra, slot), labelled(Inputs, slot), nominal, interval)
-    set_labelled(process.Extra, extra, slot)
+    step_memory = process.update_memory(labelled(process.StepMemory, slot), labelled(Inputs, slot), nominal, interval)
+    set_labelled(process.StepMemory, step_memory, slot)
 
 
 @force_inlined
@@ -90,7 +90,7 @@ def mean_power(slot: Any, frames: Any, start: Any, stop: Any, interval: Any) -> 
 
 
 @jittable
-def photograph(slot: Any, frames: Any, t: Any, ring: Any, h_c: Any) -> None:
+def store_camera_frame(slot: Any, frames: Any, t: Any, ring: Any, h_c: Any) -> None:
     """Store ring [m] and meniscus height [m] as the camera frame taken at t [s]."""
     at = slot.frames % frames.shape[0]
     frames[at, 0] = t
@@ -136,8 +136,9 @@ def _filtered(slot: Any, T_1: Any, t: Any) -> Any:
 
 
 @jittable
-def sense(slot: Any, camera: Any, pyrometer: Any, frames: Any, t: Any, seen: Any) -> None:
-    """Read pyrometer and camera at t; ``seen`` is what sensors without latency see (:class:`cz_gym.process.Seen`).
+def sample_sensors(slot: Any, camera: Any, pyrometer: Any, frames: Any, t: Any, seen: Any) -> None:
+    """Read pyrometer and camera at t; ``seen`` are the readings of noise-free sensors without latency
+    (:class:`cz_gym.process.PerfectReadings`).
 
     ``camera`` [m] (NaN: the sample drops out) and ``pyrometer`` [K] are the sample's noise. A frozen or dropped sample
     shows the last reading again.
@@ -150,7 +151,7 @@ def sense(slot: Any, camera: Any, pyrometer: Any, frames: Any, t: Any, seen: Any
     slot.valid = 0.0 if lost or flagged else 1.0
     taken, ring, h_c = t, seen.reading, seen.h_c
     if e.latency > 0.0:
-        photograph(slot, frames, t, ring, h_c)
+        store_camera_frame(slot, frames, t, ring, h_c)
         at = _delivered(slot, frames, t)
         taken, ring, h_c = frames[at, 0], frames[at, 1], frames[at, 2]
     if slot.k == 0 or not (lost or frozen):
@@ -244,8 +245,8 @@ def _accept_substep(slot: Any, frames: Any, lanes: Any, ends: Any, lane: Any, fi
     set_column(process.State, new, lanes, model.constants, lane)
     more = upto < (slot.k + 1) * fixed.interval - _EPS
     if more and slot.episode.latency > 0.0:
-        seen = process.see(new, slot.puller, m)
-        photograph(slot, frames, upto, seen.reading, seen.h_c)
+        seen = process.perfect_readings(new, slot.puller, m)
+        store_camera_frame(slot, frames, upto, seen.reading, seen.h_c)
     return slot.over == GROWS and more
 
 

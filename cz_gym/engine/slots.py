@@ -95,8 +95,8 @@ def slot_type(process: Process) -> np.dtype[Any]:
     clipped: a sample can be written again from its slot. Then the 5 s grid point that ``dT_i`` belongs to with its two
     processes [standard deviations], the episode's random streams, as far as they are drawn from, the power that heats
     [W] where the heater is slow, the pyrometer's filter with the true temperature at the last sample [K], the nominal
-    drives [m/s, W] from which the last action was counted, and what the process adds: the fields of ``Extra`` and its
-    table.
+    drives [m/s, W] from which the last action was counted, and what the process adds: the fields of ``StepMemory`` and
+    its table.
     """
     number, whole, table = np.float64, np.int64, process.table
     return np.dtype(
@@ -117,7 +117,7 @@ def slot_type(process: Process) -> np.dtype[Any]:
             ("streams", np.uint64, (len(Stream), WORDS)),
             *((name, number) for name in ("Q_heats", "T_filtered", "T_1_before")),
             *((name, number) for name in ("v_p_nominal", "Q_H_nominal")),
-            *((name, number) for name in process.Extra._fields),
+            *((name, number) for name in process.StepMemory._fields),
             *([("table", number, table)] if table[0] else []),
         ],
         align=True,
@@ -136,7 +136,7 @@ class Model(NamedTuple):
     """Length of a slot without its table [numbers of 8 bytes]."""
     info_rows: int
     """Rows of ``info``."""
-    lean_rows: tuple[int, ...]
+    brief_rows: tuple[int, ...]
     """Rows of ``info="lean"``, and that of the clipped action."""
     constants: int
     """Number of the puller's constants: place of the episode in a slot, row of the state in a lane."""
@@ -151,9 +151,9 @@ class Model(NamedTuple):
     dt_at: int
     """Row of the substep [s] in a lane; then the time that is reached [s], and whether the slot goes on."""
     lane_rows: int
-    extra: int
+    memory_at: int
     """Place in the differentiable state of what the process carries on; number of states and inputs."""
-    extras: int
+    memories: int
     """Number of what the process carries on."""
     nominal: int
     """Place of the nominal inputs in the differentiable state."""
@@ -169,9 +169,9 @@ class Model(NamedTuple):
     """Number of terms of the cost."""
     driven_by: int
     """Number of what the next inputs depend on: state, inputs, actions, the nominal inputs before."""
-    carried_by: int
+    memory_by: int
     """Number of what the carried numbers depend on: themselves, the inputs, the nominal ones."""
-    charged_by: int
+    cost_by: int
     """Number of what the cost depends on: state, inputs and those before, what is carried on."""
     channels: int
     """Number of channels of "measured"."""
@@ -183,22 +183,22 @@ class Model(NamedTuple):
 def model_of(process: Process, meniscus: MeniscusModel) -> Model:
     """The model of a process on a meniscus."""
     u, stride = len(Inputs._fields), slot_type(process).itemsize // 8
-    constants, states, loads, extras, costs = (
+    constants, states, loads, memories, costs = (
         len(kind._fields)
-        for kind in (process.Constants, process.State, process.Disturbance, process.Extra, process.Cost)
+        for kind in (process.Constants, process.State, process.Disturbance, process.StepMemory, process.Cost)
     )
-    u_at, nominal, nominals = constants + states, states + u + extras, u if process.nominal_moves else 0
+    u_at, nominal, nominals = constants + states, states + u + memories, u if process.nominal_moves else 0
     ring = nominal + nominals
-    dt_at, lean = u_at + u + loads, (*process.Lean._fields, "action_clipped")
+    dt_at, lean = u_at + u + loads, (*process.BriefInfo._fields, "action_clipped")
     return Model(
         process, meniscus, stride, stride - process.table[0] * process.table[1], len(process.info),
         tuple(map(process.info.index, lean)), constants, states, u_at, u_at + 1, u_at + u, dt_at, dt_at + 3,
-        states + u, extras, nominal, nominals, ring, ring + 2, ring + 2 + u, costs, states + 3 * u, extras + 2 * u,
-        states + 2 * u + extras, len(process.measured), states + 2 * u + extras + len(Readings._fields),
+        states + u, memories, nominal, nominals, ring, ring + 2, ring + 2 + u, costs, states + 3 * u, memories + 2 * u,
+        states + 2 * u + memories, len(process.measured), states + 2 * u + memories + len(Readings._fields),
     )  # fmt: skip
 
 
-class Fixed(NamedTuple):
+class BatchConstants(NamedTuple):
     """What all slots share and no step changes: time base, radius limit, weights of the cost, logged series."""
 
     interval: float
@@ -264,7 +264,7 @@ class ObservationScales(NamedTuple):
     share: Any
     """One over the number of samples in each span, shape (lags,)."""
     everything: bool
-    """Whether all of ``info`` is written; otherwise only the rows of ``Lean`` and ``action_clipped``."""
+    """Whether all of ``info`` is written; otherwise only the rows of ``BriefInfo`` and ``action_clipped``."""
 
 
 INFO_CHOICES = ("lean", "all")

@@ -21,7 +21,7 @@ from cz_gym.episodes.scenario import GRID
 from cz_gym.jit import column, compiled_as, hashed, jittable, kernel, labelled, scratch, set_column
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.numerics import along, plus_product, rk4
-from cz_gym.process import LOST, Inputs, Process, Readings, Seen
+from cz_gym.process import LOST, Inputs, PerfectReadings, Process, Readings
 from cz_gym.spaces import TaggedAction, check_tagged
 from cz_gym.support.errors import CzError
 
@@ -41,7 +41,7 @@ def smooth(process: Process) -> tuple[str, ...]:
     rounded to whole steps; what the process carries on; the nominal drives, where they move; the bright ring [m], and
     the camera's reading of it without the operator's bias [m]."""
     nominal = tuple(f"{name}_nominal" for name in Inputs._fields) if process.nominal_moves else ()
-    return (*process.State._fields, *Inputs._fields, *process.Extra._fields, *nominal, "ring", "reading")
+    return (*process.State._fields, *Inputs._fields, *process.StepMemory._fields, *nominal, "ring", "reading")
 
 
 def rows(process: Process) -> tuple[str, ...]:
@@ -100,10 +100,10 @@ def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, m
     k = derivatives(model.process.State, model.process.rates, (x, u), (d, p, model.meniscus), A)
     for i in range(model.states):
         by_state = column(model.process.State, A.T, 0, i)
-        for j in range(model.extra):
+        for j in range(model.memory_at):
             K[i, j] = plus_product(A[i, j], ahead, by_state, last, j)
     for i in range(model.states):
-        for j in range(model.extra):
+        for j in range(model.memory_at):
             last[i, j] = K[i, j]
             total[i, j] += weight * K[i, j]
     return k
@@ -113,7 +113,7 @@ def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, m
 def rk4_by(work: Any, x: Any, u: Any, d: Any, p: Any, dt: Any, model: Any) -> None:
     """Derivatives of :func:`cz_gym.physics.numerics.rk4` by state and inputs, into ``work[3]``."""
     for i in range(model.states):
-        for j in range(model.extra):
+        for j in range(model.memory_at):
             work[1, i, j], work[3, i, j] = 0.0, 1.0 if i == j else 0.0
     k_1 = _stage(work, dt / 6.0, 0.0, x, u, d, p, model)
     k_2 = _stage(work, dt / 3.0, 0.5 * dt, along(x, 0.5 * dt, k_1), u, d, p, model)
@@ -159,12 +159,12 @@ def _drives_by(
     else:
         derivatives(Inputs, next_inputs, (x, u, action), (before, drives, slot, interval, process), by)
     for drive in range(2):
-        for j in range(model.extra):
+        for j in range(model.memory_at):
             J[model.states + drive, j] = by[drive, j]
         for action_of in range(ACTIONS):
-            J[model.states + drive, model.smooth + action_of] = by[drive, model.extra + action_of]
+            J[model.states + drive, model.smooth + action_of] = by[drive, model.memory_at + action_of]
         for of in range(model.nominals):
-            J[model.states + drive, model.nominal + of] = by[drive, model.extra + ACTIONS + of]
+            J[model.states + drive, model.nominal + of] = by[drive, model.memory_at + ACTIONS + of]
     if model.nominals > 0:
         derivatives(Inputs, process.nominal, (x,), (slot, interval), by)
         for drive in range(2):
@@ -173,43 +173,45 @@ def _drives_by(
 
 
 @jittable
-def _carried_by(J: Any, slot: Any, extra: Any, interval: Any, model: Any) -> None:
+def _memory_by(J: Any, slot: Any, step_memory: Any, interval: Any, model: Any) -> None:
     """Derivatives of what the process carries on, from those of the inputs and the nominal ones."""
-    if model.extras > 0:
-        by, process = scratch(model.extras, model.carried_by), model.process
+    if model.memories > 0:
+        by, process = scratch(model.memories, model.memory_by), model.process
         nominal = Inputs(slot.v_p_nominal, slot.Q_H_nominal)
         if model.nominals > 0:
-            derivatives(process.Extra, process.carry, (extra, labelled(Inputs, slot), nominal), (interval,), by)
+            at: Any = step_memory, labelled(Inputs, slot), nominal
+            derivatives(process.StepMemory, process.update_memory, at, (interval,), by)
         else:
-            derivatives(process.Extra, process.carry, (extra, labelled(Inputs, slot)), (nominal, interval), by)
+            at = step_memory, labelled(Inputs, slot)
+            derivatives(process.StepMemory, process.update_memory, at, (nominal, interval), by)
         for j in range(model.columns):
-            for row in range(model.extras):
-                total = by[row, j - model.extra] if model.extra <= j < model.nominal else 0.0
+            for row in range(model.memories):
+                total = by[row, j - model.memory_at] if model.memory_at <= j < model.nominal else 0.0
                 for drive in range(2):
-                    total += by[row, model.extras + drive] * J[model.states + drive, j]
+                    total += by[row, model.memories + drive] * J[model.states + drive, j]
                 for drive in range(model.nominals):
-                    total += by[row, model.extras + 2 + drive] * J[model.nominal + drive, j]
-                J[model.extra + row, j] = total
+                    total += by[row, model.memories + 2 + drive] * J[model.nominal + drive, j]
+                J[model.memory_at + row, j] = total
 
 
 @jittable
 def _cost_by(J: Any, slot: Any, t: Any, weights: Any, model: Any) -> None:
     """Derivatives of the cost's terms, from those of the next state."""
-    process, n, by = model.process, model.states, scratch(model.costs, model.charged_by)
+    process, n, by = model.process, model.states, scratch(model.costs, model.cost_by)
     at = (
         labelled(process.State, slot.x), labelled(Inputs, slot), Inputs(slot.v_p_before, slot.Q_H_before),
-        labelled(process.Extra, slot),
+        labelled(process.StepMemory, slot),
     )  # fmt: skip
-    slopes = process.cost_slopes(derivatives(process.Cost, process.charged, at, (slot, t), by), weights)
+    slopes = process.cost_slopes(derivatives(process.Cost, process.cost_inputs, at, (slot, t), by), weights)
     for term in range(model.costs):
         row = J[model.smooth + term]
-        for i in range(model.charged_by - 2):
-            weight = by[term, i if i < model.extra else i + 2]  # between stand the inputs before
+        for i in range(model.cost_by - 2):
+            weight = by[term, i if i < model.memory_at else i + 2]  # between stand the inputs before
             if weight != 0.0:
                 for j in range(model.columns):
                     row[j] += weight * J[i, j]
         for drive in range(2):
-            row[n + drive] += by[term, model.extra + drive]
+            row[n + drive] += by[term, model.memory_at + drive]
         for j in range(model.columns):
             row[j] *= slopes[term]
 
@@ -226,23 +228,23 @@ def _nominal_of(numbers: Any, i: Any, slot: Any, model: Any) -> Any:
 def _shown_by(by_state: Any, slot: Any, t: Any, per_scale: Any, model: Any) -> None:
     """Derivatives of the "measured" channels by the differentiable state; the pyrometer's reading is of now."""
     process, by, seen_by = model.process, scratch(model.channels, model.shown_by), scratch(4, model.states)
-    x, extra, nominal = (
+    x, step_memory, nominal = (
         labelled(process.State, slot.x),
-        labelled(process.Extra, slot),
+        labelled(process.StepMemory, slot),
         Inputs(slot.v_p_nominal, slot.Q_H_nominal),
     )
-    at = x, labelled(Inputs, slot), nominal, extra, labelled(Readings, slot)
+    at = x, labelled(Inputs, slot), nominal, step_memory, labelled(Readings, slot)
     derivatives(process.Measured, process.measure, at, (slot, t), by)
-    derivatives(Seen, process.see, (x,), (slot.puller, model.meniscus), seen_by)
+    derivatives(PerfectReadings, process.perfect_readings, (x,), (slot.puller, model.meniscus), seen_by)
     reading = model.shown_by - 2
     for row in range(model.channels):
-        for j in range(model.extra):
+        for j in range(model.memory_at):
             of = by[row, j] + (by[row, reading + 1] * seen_by[3, j] if j < model.states else 0.0)
             by_state[row, j] = of * per_scale[row]
-        for j in range(model.extras):
-            by_state[row, model.extra + j] = by[row, model.extra + 2 + j] * per_scale[row]
+        for j in range(model.memories):
+            by_state[row, model.memory_at + j] = by[row, model.memory_at + 2 + j] * per_scale[row]
         for j in range(model.nominals):
-            by_state[row, model.nominal + j] = by[row, model.extra + j] * per_scale[row]
+            by_state[row, model.nominal + j] = by[row, model.memory_at + j] * per_scale[row]
         by_state[row, model.ring], by_state[row, model.ring + 1] = 0.0, by[row, reading] * per_scale[row]
 
 
@@ -265,10 +267,10 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, ...]
             slot, numbers = memory.slots[i], state.T
             set_column(process.State, slot.x, numbers, 0, i)
             state[i, model.states], state[i, model.states + 1] = slot.v_p, slot.Q_H_slewed
-            set_column(process.Extra, slot, numbers, model.extra, i)
+            set_column(process.StepMemory, slot, numbers, model.memory_at, i)
             if model.nominals > 0:
                 state[i, model.nominal], state[i, model.nominal + 1] = slot.v_p_nominal, slot.Q_H_nominal
-            state[i, model.ring] = process.see(labelled(process.State, slot.x), slot.puller, m).ring
+            state[i, model.ring] = process.perfect_readings(labelled(process.State, slot.x), slot.puller, m).ring
             state[i, model.ring + 1] = slot.ring
 
     def shown(memory: Any, per_scale: Any, interval: float, by_state: Any, start: int, stop: int) -> None:
@@ -291,7 +293,7 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, ...]
             begun, before = column(process.State, state.T, 0, i), column(Inputs, state.T, model.states, i)
             action, nominal = Inputs(actions[i, 0], actions[i, 1]), _nominal_of(state.T, i, slot, model)
             _drives_by(J, slot, begun, before, action, nominal, drives, dt, model)
-            _carried_by(J, slot, column(process.Extra, state.T, model.extra, i), dt, model)
+            _memory_by(J, slot, column(process.StepMemory, state.T, model.memory_at, i), dt, model)
             u, d = labelled(Inputs, slot), process.disturb(slot.Q_d, slot.dT_i, slot.point * GRID, e)
             point = int((slot.k - 1) * dt / GRID + _EPS)
             at, late = (point + 1) * GRID, e.latency > 0.0
@@ -302,8 +304,8 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, ...]
                 rk4_by(work, begun, u, first, p, dt - left, model)
                 begun = rk4(process.rates, begun, u, first, p, dt - left, m)
                 _copy(work, 3, 4)
-                derivatives(Seen, process.see, (begun,), (p, m), seen_by)
-                for j in range(model.extra):
+                derivatives(PerfectReadings, process.perfect_readings, (begun,), (p, m), seen_by)
+                for j in range(model.memory_at):
                     work[1, 0, j] = 0.0
                     for row in range(model.states):
                         work[1, 0, j] += seen_by[0, row] * work[4, row, j]
@@ -312,7 +314,7 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, ...]
             rk4_by(work, begun, u, d, p, left, model)
             if inside:
                 _after(work)
-            derivatives(Seen, process.see, (labelled(process.State, slot.x),), (p, m), seen_by)
+            derivatives(PerfectReadings, process.perfect_readings, (labelled(process.State, slot.x),), (p, m), seen_by)
             for j in range(model.columns):
                 for row in range(model.states):
                     J[row, j] = _through_drives(work[3, row], J, j, model)
@@ -404,7 +406,7 @@ class DifferentiableBatch:
         self._names, info = smooth(config.process), config.process.info
         self._state = np.zeros((num_envs, len(self._names)))
         self._costs = [info.index(f"term_{name}") for name in config.process.Cost._fields]
-        self._errors = [info.index(name) for name in (*config.process.Lean._fields[:2], "ring_offset")]
+        self._errors = [info.index(name) for name in (*config.process.BriefInfo._fields[:2], "ring_offset")]
         self.grows, self._begun = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
         """Whether each crystal grew in the last step, and whether each slot has one, shape (n,)."""
         self._work = np.zeros(work_shape(config.process))
@@ -436,7 +438,7 @@ class DifferentiableBatch:
         self._batch.reset(slots, keys, self._out)
         self.grows = self.grows.copy()
         self.grows[slots] = self._begun[slots] = True
-        self._look(first=True)
+        self._update_state(first=True)
         return self._state, self._out.observation
 
     def step(self, actions: npt.ArrayLike) -> Step:
@@ -460,7 +462,7 @@ class DifferentiableBatch:
         batch.step(given, out, active)
         self.grows = active & ~out.terminated
         self._out = out
-        self._look()
+        self._update_state()
         jacobian = self._jacobians.new()
         step = (held, batch.actions, self.grows, batch.fixed, batch.drives)
         self._tangents(batch.memory, before, *step, self._work, jacobian, 0, n)
@@ -476,7 +478,7 @@ class DifferentiableBatch:
             new[...] = old
         return out
 
-    def _look(self, first: bool = False) -> None:
+    def _update_state(self, first: bool = False) -> None:
         """Read the slots' states, and how observations depend on them."""
         self._state = self._now()
         if self._moves or first:

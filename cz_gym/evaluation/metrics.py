@@ -80,7 +80,7 @@ def metrics(run: Rollout) -> Metrics:
     """Compute the metrics of a rollout."""
     s, alive = run.signals, run.alive
     process, v_0 = run.config.process, run.config.ranges[0]
-    value, lost = getattr(s, process.Lean._fields[0]), _lost(run)
+    value, lost = getattr(s, process.BriefInfo._fields[0]), _lost(run)
     counts = True if (alive | lost).all() else alive | lost  # not after an end with success
     grows = getattr(s, "v_g", np.full(alive.shape, np.nan))
     error, observable = radius_error(run), radius_error(run, s.ring_offset)
@@ -109,7 +109,7 @@ def metrics(run: Rollout) -> Metrics:
 
 def radius_error(run: Rollout, offset: Floats | float = 0.0) -> Floats:
     """The radius error plus an offset [m], shape (steps, episodes); from a failing step on the largest allowed one."""
-    value, reference = (getattr(run.signals, name) for name in run.config.process.Lean._fields[:2])
+    value, reference = (getattr(run.signals, name) for name in run.config.process.BriefInfo._fields[:2])
     return np.where(_lost(run), run.config.radius_limit, value - reference + offset)
 
 

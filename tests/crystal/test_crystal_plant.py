@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 from cz_gym import Parameters, make_puller
 from cz_gym.crystal import plant, recipe
-from cz_gym.crystal.plant import Disturbance, State, at_interface, complete, rates
+from cz_gym.crystal.plant import CrystalState, Disturbance, at_interface, complete, rates
 from cz_gym.crystal.process import nominal_recipe
 from cz_gym.crystal.recipe import shape_at
 from cz_gym.episodes.draw import Episode, Factors
@@ -40,7 +40,7 @@ def test_a_crystal_without_end_over_a_charge_without_end_is_the_body(lam, rng):
     Q_d, dT_i = rng.normal(0, 1000, n), rng.normal(0, 1, n)
     each = (map(float, numbers) for numbers in zip(*x, *u, Q_d, dT_i, strict=True))
     found = [
-        rates(State(r_c, h_c, *T, 1.0, 1e9, 0.0, 1.0), Inputs(v_p, Q_H), Disturbance(*load), p, HURLE)
+        rates(CrystalState(r_c, h_c, *T, 1.0, 1e9, 0.0, 1.0), Inputs(v_p, Q_H), Disturbance(*load), p, HURLE)
         for r_c, h_c, *T, v_p, Q_H, Q, dT in each
         for load in [(Q, dT)]
     ]
@@ -50,12 +50,12 @@ def test_a_crystal_without_end_over_a_charge_without_end_is_the_body(lam, rng):
         np.testing.assert_allclose(mine, bodys, rtol=1e-12, atol=1e-12 * np.abs(bodys).max())
 
 
-Audit = namedtuple("Audit", (*State._fields, "gained"))
+Audit = namedtuple("Audit", (*CrystalState._fields, "gained"))
 """The state, and the heat that came from outside less what left."""
 
 
 def audited(x, u, d, p, m):
-    rate = rates(State(*x[:9]), u, d, p, m)
+    rate = rates(CrystalState(*x[:9]), u, d, p, m)
     Phi_l = at_interface(x, d, p, m.slope).Phi_l
     surface = p.emission * math.pi * (p.R_cr**2 - x.r_c**2) * (x.T_b**4 - p.T_e**4)
     gain = u.Q_H - p.G_1a * (x.T_1 - p.T_a) - surface - math.pi * x.r_c**2 * Phi_l + d.Q_d
@@ -99,7 +99,9 @@ def test_mass_dopant_and_energy_over_a_whole_crystal():
 def test_rk4_converges_with_the_fourth_order_in_the_crown():
     p, table = nominal_recipe(DESIGN, HURLE)
     x, u, d = recipe.state_at(0.02, table, p, EPISODE), Inputs(2.4e-5, 5.6e4), Disturbance(200.0, 0.3)
-    exact = solve_ivp(lambda t, y: rates(State(*y), u, d, p, HURLE), (0, 40), x, "DOP853", rtol=1e-13, atol=1e-15)
+    exact = solve_ivp(
+        lambda t, y: rates(CrystalState(*y), u, d, p, HURLE), (0, 40), x, "DOP853", rtol=1e-13, atol=1e-15
+    )
     scale, errors = np.maximum(np.abs(exact.y[:, -1]), 1e-6), []
     for steps in (4, 8, 16):
         y = x

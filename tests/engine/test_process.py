@@ -24,7 +24,7 @@ from cz_gym.evaluation.results import summarise
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.jit import force_inlined, jittable
 from cz_gym.physics.schedule import bias_offset, recipe, reference
-from cz_gym.process import DONE, GROWS, LOST, PULL_SCALE, Channel, Inputs, Past, Process, Relative, Seen
+from cz_gym.process import DONE, GROWS, LOST, PULL_SCALE, Channel, Inputs, Past, PerfectReadings, Process, Relative
 from cz_gym.tools.report.tables import DRIVES, ERROR, rows
 from cz_gym.tools.run import run_episodes
 from tests.vector_checker import check_vector_env
@@ -67,7 +67,7 @@ class Truth(NamedTuple):
     T: Annotated[Any, WARM]
 
 
-class Lean(NamedTuple):
+class BriefInfo(NamedTuple):
     h: Any
     h_ref: Any
 
@@ -77,7 +77,7 @@ LOG |= {f"term_{name}": ONE for name in Cost._fields} | {"action_clipped": ONE}
 Log: Any = NamedTuple("Log", [(name, Annotated[Any, channel]) for name, channel in LOG.items()])
 
 
-class Extra(NamedTuple):
+class StepMemory(NamedTuple):
     fed: Any
 
 
@@ -107,7 +107,7 @@ def accept(slot, x, new, u, d, t, dt, limit, m):
 
 
 @jittable
-def measure(x, u, about, extra, readings, slot, t):
+def measure(x, u, about, memory, readings, slot, t):
     p, e, h_ref = slot.puller, slot.episode, reference(t, slot.episode)
     drives = u.v_p - about.v_p, u.Q_H - about.Q_H
     return Read(readings.ring - p.h_0 - h_ref, slot.valid, h_ref, recipe(t, e), readings.T_1 - p.T_0, *drives)
@@ -127,21 +127,23 @@ def logged(slot, measured, cost, t, ring, m):
 
 
 @jittable
-def charged(x, u, before, extra, slot, t):
+def cost_inputs(x, u, before, memory, slot, t):
     error = x.h - slot.puller.h_0 - reference(t, slot.episode) + bias_offset(t, slot.episode)
-    return Cost(error, u.v_p / slot.puller.v_0 - 1.0 + 0.0 * extra.fed, u.v_p - before.v_p, u.Q_H - before.Q_H)
+    return Cost(error, u.v_p / slot.puller.v_0 - 1.0 + 0.0 * memory.fed, u.v_p - before.v_p, u.Q_H - before.Q_H)
 
 
 TANK = Process(
-    Tank, Level, Load, Read, Truth, Log, Lean, Cost, (Past("level", MM),), (Relative("T", "T_ref", 2.0, "-"),),
+    Tank, Level, Load, Read, Truth, Log, BriefInfo, Cost, (Past("level", MM),), (Relative("T", "T_ref", 2.0, "-"),),
     check=lambda parameters, meniscus: parameters, derive=derive, begin=begin, nominal=nominal,
     hidden_load=jittable(lambda p_drift, p: -p.G * p_drift), disturb=jittable(lambda Q_d, dT_i, t, e: Load(Q_d)),
-    rates=rates, accept=accept, see=jittable(lambda x, p, m: Seen(x.h, x.h, 0.0 * x.h, x.T)), measure=measure,
+    perfect_readings=jittable(lambda x, p, m: PerfectReadings(x.h, x.h, 0.0 * x.h, x.T)),
+    rates=rates, accept=accept, measure=measure, cost_inputs=cost_inputs,
     true_state=jittable(lambda slot, seen, t: Truth(slot.x.h - slot.puller.h_0, slot.x.T - slot.puller.T_0)),
-    logged=logged, lean=jittable(lambda slot, seen: Lean(slot.x.h, slot.puller.h_0 + seen.h_ref)), charged=charged,
-    cost_terms=cost_terms, cost_slopes=cost_slopes, reward=reward, Extra=Extra,
+    logged=logged, brief_info=jittable(lambda slot, seen: BriefInfo(slot.x.h, slot.puller.h_0 + seen.h_ref)),
+    cost_terms=cost_terms, cost_slopes=cost_slopes, reward=reward, StepMemory=StepMemory,
     points=lambda p: [(Level(0.9 * p.h_0, p.T_0 + 5.0), Inputs(p.v_0, 100.0), Load(3.0))],
-    weights=WEIGHTS, carry=jittable(lambda extra, u, about, dt: Extra(extra.fed + u.v_p * dt)), table=(3, 2),
+    update_memory=jittable(lambda memory, u, about, dt: StepMemory(memory.fed + u.v_p * dt)),
+    weights=WEIGHTS, table=(3, 2),
 )  # fmt: skip
 # The end of the process.
 

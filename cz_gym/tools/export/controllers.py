@@ -13,7 +13,7 @@ import numpy as np
 from cz_gym.body.process import BODY
 from cz_gym.body.signals import Measured
 from cz_gym.config import Config
-from cz_gym.engine.kernels import recall, remember
+from cz_gym.engine.kernels import update_history, write_history
 from cz_gym.process import scales
 from cz_gym.puller.file import DEFAULT
 from cz_gym.spaces import CLIP, HEATER_SLACK, HISTORY, INTEGRAL_SCALE, LAGGED, MEASURED, drives_of, lags
@@ -168,8 +168,8 @@ class Agent:
         share = 1.0 / (self.before - self.newest)
         sizes = 1.0 / scales(MEASURED, *self.ranges)
         constants = SimpleNamespace(newest=self.newest, before=self.before, share=share, measured=sizes)
-        _uncompiled(remember, sums)(slot, sums, self.dt, out, BODY)
-        _uncompiled(recall, sums)(slot, seen, sums, constants, out, BODY)
+        _uncompiled(update_history, sums)(slot, sums, self.dt, out, BODY)
+        _uncompiled(write_history, sums)(slot, seen, sums, constants, out, BODY)
         table = np.concatenate([sums[1:] - sums[0], np.zeros((1, len(LAGGED), n))])
         return out.T, past._replace(sums=np.moveaxis(table, -1, 0), integral=slot.integral)
 
