@@ -33,7 +33,7 @@ FEW_UPDATES = 50
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recipe:
+class TrainingConfig:
     """Hyperparameters of every learner; fields have the names of stable-baselines3's arguments."""
 
     name: str
@@ -87,7 +87,7 @@ class Recipe:
 
 
 @dataclass(frozen=True, kw_only=True)
-class APG(Recipe):
+class APG(TrainingConfig):
     """Analytic policy gradients: follows the gradient of the cost through policy, memory and plant."""
 
     name: str = "gradient"
@@ -110,7 +110,7 @@ class APG(Recipe):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reinforcement(Recipe):
+class Reinforcement(TrainingConfig):
     """Learns from reward, by trying; stable-baselines3's ``VecNormalize`` scales the reward. Observations are scaled by
     the environment: running means would remember the lost crystals of the first minutes, and make a reading that is
     not valid, one in hundreds, an input of -10. Critics that are told read the plant's true state
@@ -198,14 +198,14 @@ class SAC(Reinforcement):
 
 PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64))
 """stable-baselines3's own PPO, told nothing: beside ``ppo`` it shows what the true state is worth in training."""
-RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG())}
+RECIPES: dict[str, TrainingConfig] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG())}
 """Recipes by name: the choices of ``train.py --algo``."""
 _along: dict[str, Any] = {
     "environment": CRYSTAL,
     "stages": ("crown", "body", "tail"),
     "scenario": "randomized=0.5,hard=0.5",
 }
-CRYSTAL_RECIPES: dict[str, Recipe] = {
+CRYSTAL_RECIPES: dict[str, TrainingConfig] = {
     "ppo": PPO(name="ppo-along", **_along),
     "gradient": APG(name="gradient-along", num_envs=96, steps=17_280_000, **_along),
 }
@@ -217,7 +217,7 @@ DEFAULT = "ppo"
 # From a recipe to an algorithm with stable-baselines3's interface, on the native batch.
 
 
-def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
+def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0) -> BaseAlgorithm:
     """The algorithm of a recipe for a training seed; a resumed one has taken ``done`` steps before."""
     torch.set_num_threads(1)  # small networks are quicker so
     torch.manual_seed(seed)
@@ -258,7 +258,7 @@ def make_algorithm(recipe: Recipe, seed: int, done: int = 0) -> BaseAlgorithm:
     return made
 
 
-def repeat_of(recipe: Recipe) -> int:
+def repeat_of(recipe: TrainingConfig) -> int:
     """Environment steps of each of the algorithm's time steps."""
     return recipe.action_repeat if isinstance(recipe, Reinforcement) else 1
 

@@ -1,7 +1,9 @@
-"""Checkpoints: algorithm, best agent and progress in one file, a model of stable-baselines3 with a few members more.
+"""A training run in its folder: it learns, validates, keeps the best agent, and goes on after a stop.
 
-One file is replaced at one moment, and a resumed run writes the run's other files again from it. Only tensors are read
-from the model (``torch.load`` with ``weights_only``), never pickled objects: hyperparameters are the run's settings.
+One checkpoint file holds the learner's tensors, the progress and the run's other files; it is replaced at one moment,
+and a resumed run writes the other files again from it. Only tensors, numbers and bytes are read back (``torch.load``
+with ``weights_only``): hyperparameters are the run's settings. A resumed run goes on from the last checkpoint, not bit
+for bit as if it had never stopped.
 """
 
 import csv
@@ -17,8 +19,7 @@ import traceback
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
-from functools import partial
+from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import parent_process
 from operator import attrgetter
 from pathlib import Path
@@ -28,7 +29,6 @@ import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
 from stable_baselines3.common.utils import configure_logger
 from tqdm import tqdm
 
@@ -43,19 +43,24 @@ from .asymmetric import Asymmetric, LearnState
 from .contract import MAX_JSON_BYTES, AgentFileError, agent_files, read_bounded, read_json
 from .export import to_agent
 from .policy import OnnxPolicy
-from .recipes import Recipe, make_algorithm, repeat_of
-from .validation import COLUMNS, References, beside, validate
+from .recipes import TrainingConfig, make_algorithm, repeat_of
 
-PROGRESS = "cz-gym-checkpoint-6.json"
-"""Member that holds :class:`Progress`; its name says the format's version."""
+CHECKPOINT = "checkpoint.zip"
+"""Name of the checkpoint in a run's folder."""
 MAX_BYTES = 64_000_000
 """Largest checkpoint that is read."""
 FILES = ("agent.onnx", "agent.json", "progress.csv", "progress.png", "summary.json")
 """Files of a run that its checkpoint may hold."""
+VALIDATE_EVERY = 200_000
+"""Least number of steps between validations."""
+PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "stable-baselines3", "torch", "onnx", "onnxruntime")
+"""Packages whose versions a run's settings name."""
+SETTINGS = {"algorithm": str, "seed": int, "settings": dict, "steps": int, "sessions": list}
+"""Fields of ``settings.json`` that a resumed run reads, and their types."""
 
 
-class Progress(NamedTuple):
-    """The state of a training run beside its algorithm's tensors."""
+class Checkpoint(NamedTuple):
+    """Content of a checkpoint file."""
 
     steps: int
     """Environment steps taken."""
@@ -65,247 +70,157 @@ class Progress(NamedTuple):
     """Least validation cost so far [-]; None before the first."""
     returns: tuple[float, ...]
     """Mean, variance and count of the returns that rewards are normalised with; empty without a VecNormalize."""
-
-
-class Learned(NamedTuple):
-    """The tensors of an algorithm that training changes."""
-
-    states: dict[str, Any]
-    """State of each network and optimiser, by name."""
+    parameters: dict[str, Any]
+    """State of each network and optimiser, by name (stable-baselines3's ``get_parameters``)."""
     variables: dict[str, torch.Tensor]
     """Tensors that belong to none of them, by name."""
+    files: dict[str, bytes]
+    """The run's other files, by name."""
 
 
 def to_bytes(
     algorithm: BaseAlgorithm, seconds: float, best_cost: float | None, files: Mapping[str, bytes] | None = None
 ) -> bytes:
-    """The checkpoint of an algorithm, without its replay buffer, and the run's ``files`` by name.
+    """Checkpoint of an algorithm, without its replay buffer, and of the run's other files.
 
     AgentFileError if it learned numbers that are not finite: no run could continue from them.
     """
-    lone = algorithm._get_torch_save_params()[1]
-    learned = Learned(algorithm.get_parameters(), {name: attrgetter(name)(algorithm) for name in lone})
-    if not all(tensor.isfinite().all() for tensor in _tensors(learned)):
+    variables = {name: attrgetter(name)(algorithm) for name in algorithm._get_torch_save_params()[1]}
+    if not all(tensor.isfinite().all() for tensor in (*algorithm.policy.state_dict().values(), *variables.values())):
         raise AgentFileError("the training went wrong: a weight is not finite; the last checkpoint stays")
     env: Any = algorithm.get_vec_normalize_env()
-    returns = (
-        () if env is None else tuple(float(each) for each in (env.ret_rms.mean, env.ret_rms.var, env.ret_rms.count))
-    )
-    progress = Progress(environment_steps(algorithm), seconds, best_cost, returns)
+    returns = () if env is None else (env.ret_rms.mean, env.ret_rms.var, env.ret_rms.count)
+    checkpoint = Checkpoint(
+        environment_steps(algorithm), seconds, best_cost, tuple(map(float, returns)),
+        algorithm.get_parameters(), variables, dict(files or {}),
+    )  # fmt: skip
     content = io.BytesIO()
-    save_to_zip_file(content, params=learned.states, pytorch_variables=learned.variables)
-    with zipfile.ZipFile(content, "a") as archive:
-        for name, member in {PROGRESS: json.dumps(progress._asdict()).encode(), **(files or {})}.items():
-            archive.writestr(name, member)
+    torch.save(checkpoint._asdict(), content)
     return content.getvalue()
 
 
-def load_checkpoint(path: Path) -> tuple[Progress, Learned, dict[str, bytes]]:
-    """Progress, tensors and the run's files of a checkpoint; AgentFileError if it cannot be read."""
+def load_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint; AgentFileError if that cannot be done."""
     content = io.BytesIO(read_bounded(path, MAX_BYTES))
     try:
         with zipfile.ZipFile(content) as archive:
             if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
                 raise ValueError("packed members could be larger than the file")
-            progress = Progress(**json.loads(archive.read(PROGRESS)))
-            numbers = (progress.steps, progress.seconds, progress.best_cost or 0.0, *progress.returns)
-            if type(progress.steps) is not int or not all(map(math.isfinite, numbers)) or len(numbers) not in (3, 6):
-                raise ValueError("does not say where the run stood")
-            files = {name: archive.read(name) for name in FILES if name in archive.namelist()}
-        _, states, variables = load_from_zip_file(content, load_data=False, device="cpu")
-    except Exception:  # a damaged file makes zipfile, json and torch raise whatever they like
+        content.seek(0)
+        checkpoint = Checkpoint(**torch.load(content, map_location="cpu", weights_only=True))
+        numbers = (checkpoint.steps, checkpoint.seconds, checkpoint.best_cost or 0.0, *checkpoint.returns)
+        files, known = checkpoint.files.items(), len(numbers) in (3, 6) and all(map(math.isfinite, numbers))
+        if not known or type(checkpoint.steps) is not int or checkpoint.steps < 0:
+            raise ValueError("does not say where the run stood")
+        if not all(name in FILES and isinstance(member, bytes) for name, member in files):
+            raise ValueError("holds files that no run writes")
+    except Exception:  # a damaged file makes zipfile and torch raise whatever they like
         raise AgentFileError(f"{path}: not a checkpoint of this release, or damaged") from None
-    return progress, Learned(states, variables or {}), files
+    return checkpoint
 
 
-def restore(algorithm: BaseAlgorithm, progress: Progress, learned: Learned, path: Path) -> None:
+def restore(algorithm: BaseAlgorithm, checkpoint: Checkpoint, path: Path) -> None:
     """Put a checkpoint into an algorithm made with the same settings; AgentFileError if it does not fit."""
     env: Any = algorithm.get_vec_normalize_env()
     try:
-        algorithm.set_parameters(learned.states, exact_match=True, device="cpu")
+        algorithm.set_parameters(checkpoint.parameters, exact_match=True, device="cpu")
         with torch.no_grad():
             for name in algorithm._get_torch_save_params()[1]:
-                attrgetter(name)(algorithm).copy_(learned.variables[name])
+                attrgetter(name)(algorithm).copy_(checkpoint.variables[name])
         if env is not None:
-            env.ret_rms.mean, env.ret_rms.var, env.ret_rms.count = map(np.float64, progress.returns)
+            env.ret_rms.mean, env.ret_rms.var, env.ret_rms.count = map(np.float64, checkpoint.returns)
     except Exception:  # torch raises whatever it likes where names, types or shapes differ
         raise AgentFileError(f"{path}: does not fit this run's settings") from None
 
 
-def _tensors(value: Any) -> Iterator[torch.Tensor]:
-    """Every tensor of floats inside nested mappings and sequences."""
-    if isinstance(value, torch.Tensor):
-        yield from [value] if value.is_floating_point() else []
-    elif isinstance(value, (Mapping, list, tuple)):
-        for each in value.values() if isinstance(value, Mapping) else value:
-            yield from _tensors(each)
+@dataclass
+class TrainingRun:
+    """The run of one training seed in its folder, continued from the checkpoint there.
 
-
-# The files of a run's folder beside its checkpoint: settings with provenance, and the progress of validations.
-
-PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "stable-baselines3", "torch", "onnx", "onnxruntime")
-SETTINGS = {"algorithm": str, "seed": int, "settings": dict, "steps": int, "sessions": list}
-"""Fields of ``settings.json`` that a resumed run reads, and their types."""
-
-
-def check_settings(folder: Path, recipe: Recipe, seed: int) -> list[dict[str, Any]]:
-    """The sessions of the run in this folder; AgentFileError if it is another run."""
-    path = folder / "settings.json"
-    saved = read_settings(path)
-    for name, value in identity(recipe, seed).items():
-        if saved.get(name) != value:
-            raise AgentFileError(f"{path}: the run was begun with another {name}; resume it with the same options")
-    return list(saved["sessions"])
-
-
-def identity(recipe: Recipe, seed: int) -> dict[str, Any]:
-    """The settings that a resumed run must share with the one that was begun; it may be longer."""
-    settings = {name: value for name, value in asdict(recipe).items() if name != "steps" and value not in ("", ())}
-    return {
-        "algorithm": recipe.name,
-        "seed": seed,
-        "settings": json.loads(json.dumps(settings)),
-        "plant_hash": recipe.config.plant_hash,
-        "scenario_hash": recipe.config.scenario.hash,
-    }
-
-
-def read_settings(path: Path) -> dict[str, Any]:
-    """The contents of ``settings.json``; AgentFileError unless a run wrote it."""
-    try:
-        saved = read_json(path)
-        sound = all(type(saved[name]) is kind for name, kind in SETTINGS.items()) and 0 < saved["steps"] < 2**63
-        if not sound or not saved["sessions"] or not all(isinstance(session, dict) for session in saved["sessions"]):
-            raise KeyError
-    except (AgentFileError, KeyError, TypeError, IndexError):
-        raise AgentFileError(f"{path}: missing or damaged, so there is nothing to resume") from None
-    return dict(saved)
-
-
-def provenance() -> dict[str, Any]:
-    """The command, and the software it runs on: git commit, Python, packages."""
-    command = " ".join([Path(sys.executable).name, Path(sys.argv[0]).name, *sys.argv[1:]])
-    return {"command": command, "git_commit": _git_commit(), **software(PACKAGES)}
-
-
-def _git_commit() -> str | None:
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    try:
-        return subprocess.run(
-            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
-        ).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return None
-
-
-def to_json(content: Any) -> bytes:
-    """The contents of a JSON file."""
-    return (json.dumps(content, indent=2) + "\n").encode()
-
-
-def to_csv(rows: Sequence[dict[str, Any]]) -> bytes:
-    """The contents of a CSV file, as ``progress.csv``: a line a validation."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]))
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue().encode()
-
-
-def read_rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of ``progress.csv``; none without a file. AgentFileError if no run wrote it."""
-    if not path.exists():
-        return []
-    try:
-        rows = list(csv.DictReader(io.StringIO(read_bounded(path, MAX_JSON_BYTES).decode(), newline="")))
-        named = all(list(row)[: len(COLUMNS)] == list(COLUMNS) for row in rows)
-        if not named or not all(math.isfinite(float(value)) for row in rows for value in row.values()):
-            raise ValueError
-    except (ValueError, TypeError, csv.Error):
-        raise AgentFileError(f"{path}: damaged; without it the run can be resumed") from None
-    return rows
-
-
-# A training run in its folder: settings and provenance, checkpoints, the best agent so far, progress.
-
-CHECKPOINT = "checkpoint.zip"
-VALIDATE_EVERY = 200_000
-"""Least number of steps between validations."""
-MAX_SESSIONS = 100
-"""Number of sessions that settings list, beside the first and the present one."""
-
-
-class Job(NamedTuple):
-    """A training seed's run."""
+    A value names the run and its settings, and pickles; :meth:`train` makes the learner and trains it. Raises
+    AgentFileError if the folder cannot be used.
+    """
 
     folder: Path
-    recipe: Recipe
+    recipe: TrainingConfig
     seed: int
-    references: References
+    references: validation.References
     """RMSEs of classical controllers on the same crystals, shown beside the agent's."""
     checkpoint_seconds: float = 60.0
     """Longest time between checkpoints, apart from validations and updates in between [s]."""
     plot: bool = False
     """Whether to draw the progress into the folder."""
+    files: dict[str, bytes] = field(default_factory=dict, init=False, repr=False)
+    """The run's other files as the next checkpoint holds them."""
+    rows: list[dict[str, Any]] = field(default_factory=list, init=False, repr=False)
+    """Rows of ``progress.csv``."""
+    best_cost: float | None = field(default=None, init=False)
+    algorithm: BaseAlgorithm = field(init=False, repr=False)
 
     @property
     def sessions(self) -> list[dict[str, Any]]:
         """Sessions of the run in its folder, empty before the first; AgentFileError if that is another run."""
-        exists = (self.folder / "settings.json").exists()
-        return check_settings(self.folder, self.recipe, self.seed) if exists else []
+        path = self.folder / "settings.json"
+        if not path.exists():
+            return []
+        saved = read_settings(path)
+        for name, value in self._identity().items():
+            if saved.get(name) != value:
+                raise AgentFileError(f"{path}: the run was begun with another {name}; resume it with the same options")
+        return list(saved["sessions"])
 
     @property
     def summary(self) -> dict[str, float] | None:
-        """The summary of the run; None before its end."""
+        """Content of ``summary.json``; None before the run's end."""
         path = self.folder / "summary.json"
         saved = read_json(path) if self.sessions and path.exists() else None
         steps = saved.get("steps") if isinstance(saved, dict) else None
         return saved if isinstance(steps, int) and steps >= self.recipe.steps else None
-
-
-class Run:
-    """One training run, continued from its folder's checkpoint if it has begun there.
-
-    The checkpoint holds the run's other files too: best agent, progress and, with ``plot``, a picture of it. Raises
-    AgentFileError if the folder cannot be used.
-    """
-
-    def __init__(self, job: Job) -> None:
-        folder, recipe, seed = self.folder, self.recipe, self.seed = job[:3]
-        self.job = job
-        self.config = recipe.config
-        self.files: dict[str, bytes] = {}
-        self.rows: list[dict[str, Any]] = []
-        self.best: float | None = None
-        self.began, sessions = time.monotonic(), job.sessions
-        if sessions:
-            progress, learned, self.files = load_checkpoint(folder / CHECKPOINT)
-            write_files({folder / name: content for name, content in self.files.items()})
-            self.rows, self.best = read_rows(folder / "progress.csv"), progress.best_cost
-            self.began -= progress.seconds
-            self.algorithm = make_algorithm(recipe, seed, progress.steps)
-            restore(self.algorithm, progress, learned, folder / CHECKPOINT)
-            self.saved, self.saved_steps = time.monotonic(), self.steps
-        else:
-            self.algorithm = make_algorithm(recipe, seed)
-            self.save()
-        # Made last: a run that is refused leaves no folder.
-        self.logger = configure_logger(0, str(folder / "tensorboard"), "run", reset_num_timesteps=False)
-        self.algorithm.set_logger(self.logger)
-        self.validate_every = max(recipe.steps // 24, VALIDATE_EVERY)
-        self._write_settings(sessions)
 
     @property
     def steps(self) -> int:
         """Environment steps taken."""
         return environment_steps(self.algorithm)
 
-    def learn(self, bar: Any) -> None:
-        """Learn to the end, validating and saving on the way; nothing if that is done.
+    def train(self, bar: Any = None) -> dict[str, float]:
+        """Train to the end, from the checkpoint if there is one; returns the content of ``summary.json``.
 
-        ``bar`` counts environment steps, as tqdm's does. Ctrl-C ends the run between two updates, with a checkpoint, by
+        ``bar`` is tqdm's and counts environment steps. Ctrl-C ends the run between two updates, with a checkpoint, by
         KeyboardInterrupt.
         """
+        with locked(self.folder):
+            if summary := self.summary:
+                return summary
+            self.begin()
+            self.learn(tqdm(disable=True) if bar is None else bar)
+            return self.finish()
+
+    def begin(self) -> None:
+        """Make the learner, as it stands in the checkpoint if there is one, and write the settings."""
+        self.began, sessions = time.monotonic(), self.sessions
+        if sessions:
+            checkpoint = load_checkpoint(self.folder / CHECKPOINT)
+            self.files, self.best_cost = checkpoint.files, checkpoint.best_cost
+            write_files({self.folder / name: content for name, content in self.files.items()})
+            self.rows = read_rows(self.folder / "progress.csv")
+            self.began -= checkpoint.seconds
+            self.algorithm = make_algorithm(self.recipe, self.seed, checkpoint.steps)
+            restore(self.algorithm, checkpoint, self.folder / CHECKPOINT)
+            self.saved, self.saved_steps = time.monotonic(), self.steps
+        else:
+            self.algorithm = make_algorithm(self.recipe, self.seed)
+            self.save()
+        # Made last: a run that is refused leaves no folder.
+        self.logger = configure_logger(0, str(self.folder / "tensorboard"), "run", reset_num_timesteps=False)
+        self.algorithm.set_logger(self.logger)
+        command = " ".join([Path(sys.executable).name, Path(sys.argv[0]).name, *sys.argv[1:]])
+        session = {"from_step": self.steps, "command": command, "git_commit": _git_commit(), **software(PACKAGES)}
+        first = sessions[0] if sessions else session
+        facts = {**self._identity(), "steps": self.recipe.steps, **first, "sessions": [*sessions, session]}
+        write_files({self.folder / "settings.json": _to_json(facts)})
+
+    def learn(self, bar: Any) -> None:
+        """Learn to the end, validating and saving on the way; nothing if that is done."""
         bar.update(self.steps - bar.n)
         with deferred_interrupt() as interrupted:
             if self.steps < self.recipe.steps:
@@ -319,52 +234,30 @@ class Run:
 
     def save(self) -> None:
         """Write a checkpoint, then the files that it holds; only between updates."""
-        content = to_bytes(self.algorithm, time.monotonic() - self.began, self.best, self.files)
+        content = to_bytes(self.algorithm, time.monotonic() - self.began, self.best_cost, self.files)
         write_files({self.folder / name: content for name, content in {CHECKPOINT: content, **self.files}.items()})
         self.saved, self.saved_steps = time.monotonic(), self.steps
 
-    def _hold(self, files: Mapping[Path, bytes]) -> None:
-        """Put files of the folder into the next checkpoint."""
-        self.files |= {path.name: content for path, content in files.items()}
-
-    def finish(self) -> dict[str, float]:
-        """Test the best agent on episodes that did not choose it; the contents of ``summary.json``."""
-        path = self.folder / "agent.onnx"
-        agent = OnnxPolicy.load(path, self.config)
-        figures = validate(agent, self.config, validation.JUDGING)
-        summary = {
-            "validation_episodes": len(validation.JUDGING),
-            "validation_cost": figures.cost,
-            "validation_rmse_mm": figures.rmse_mm,
-            **{beside(name): judged for name, (_, judged) in self.job.references.items()},
-            "pull_step_rms_mm_per_min": figures.pull_step_rms_mm_per_min,
-            "failure_rate": figures.failure_rate,
-            "chosen_at": agent.contract.training_steps,
-            "steps": self.steps,
-            "seconds": time.monotonic() - self.began,
-        }
-        whole_run = replace(agent.contract, training_steps=self.steps)
-        self._hold(agent_files(path, agent.content, figures.put_into(whole_run)))
-        self._hold({self.folder / "summary.json": to_json(summary)})
-        self.save()
-        return summary
-
     def validate(self, bar: Any) -> None:
         """Export the actor as it stands and run the file itself on validation episodes; keep it if it is the best."""
-        path, normalisation = self.folder / "agent.onnx", self.algorithm.get_vec_normalize_env()
-        agent = to_agent(self.algorithm, self.recipe.name, self.seed, self.config, normalisation, path)
-        figures = validate(agent, self.config, validation.PICKING)
-        if self.best is None or figures.cost < self.best:
-            self.best = figures.cost
-            self._hold(agent_files(path, agent.content, figures.put_into(agent.contract)))
-        picked = {name: picked for name, (picked, _) in self.job.references.items()}
+        path, config = self.folder / "agent.onnx", self.recipe.config
+        normalisation = self.algorithm.get_vec_normalize_env()
+        agent = to_agent(self.algorithm, self.recipe.name, self.seed, config, normalisation, path)
+        figures = validation.validate(agent, config, validation.PICKING)
+        if self.best_cost is None or figures.cost < self.best_cost:
+            self.best_cost = figures.cost
+            self._keep_agent(agent, figures)
+        picked = {name: rmse_mm for name, (rmse_mm, _) in self.references.items()}
         row = self.steps, round(time.monotonic() - self.began, 1), *figures, *picked.values()
-        self.rows.append(dict(zip((*COLUMNS, *map(beside, picked)), row, strict=True)))
-        self._hold({self.folder / "progress.csv": to_csv(self.rows)})
-        if self.job.plot:
-            from .validation import curves
-
-            self._hold({self.folder / "progress.png": curves({self.recipe.name: [self.rows]})})
+        names = (*validation.COLUMNS, *map(validation.reference_column, picked))
+        self.rows.append(dict(zip(names, row, strict=True)))
+        text = io.StringIO()
+        writer = csv.DictWriter(text, fieldnames=names)
+        writer.writeheader()
+        writer.writerows(self.rows)
+        self.files["progress.csv"] = text.getvalue().encode()
+        if self.plot:
+            self.files["progress.png"] = validation.curves({self.recipe.name: [self.rows]})
         self.save()
         for name, figure in figures._asdict().items():
             self.logger.record(f"validation/{name}", figure)
@@ -374,30 +267,69 @@ class Run:
         if not sys.stderr.isatty() and parent_process() is None:  # a log holds lines
             print(f"{self.steps:,} steps: {figures_now}", flush=True)
 
-    def _write_settings(self, sessions: list[dict[str, Any]]) -> None:
-        """Write the run's settings; each time it is begun or resumed adds a session."""
-        session = {"from_step": self.steps, **provenance()}
-        first = sessions[0] if sessions else session
-        sessions = [*sessions[:1], *sessions[1:][-MAX_SESSIONS:], session]
-        facts = {**identity(self.recipe, self.seed), "steps": self.recipe.steps, **first, "sessions": sessions}
-        write_files({self.folder / "settings.json": to_json(facts)})
+    def finish(self) -> dict[str, float]:
+        """Test the best agent on episodes that did not choose it; returns the content of ``summary.json``."""
+        agent = OnnxPolicy.load(self.folder / "agent.onnx", self.recipe.config)
+        figures = validation.validate(agent, self.recipe.config, validation.JUDGING)
+        summary = {
+            "validation_episodes": len(validation.JUDGING),
+            "validation_cost": figures.cost,
+            "validation_rmse_mm": figures.rmse_mm,
+            **{validation.reference_column(name): judged for name, (_, judged) in self.references.items()},
+            "pull_step_rms_mm_per_min": figures.pull_step_rms_mm_per_min,
+            "failure_rate": figures.failure_rate,
+            "chosen_at": agent.contract.training_steps,
+            "steps": self.steps,
+            "seconds": time.monotonic() - self.began,
+        }
+        self._keep_agent(agent, figures)
+        self.files["summary.json"] = _to_json(summary)
+        self.save()
+        return summary
+
+    def poll_progress(self) -> tuple[float, str]:
+        """Share of the run that was done at its last validation [-], and a few words on it."""
+        rows = read_rows(self.folder / "progress.csv")
+        if not rows:
+            return 0.0, f"{self.seed}: 0%"
+        share = min(float(rows[-1]["steps"]) / self.recipe.steps, 1.0)
+        return share, f"{self.seed}: {share:.0%} {float(rows[-1]['validation_rmse_mm']):.3f} mm"
+
+    def _keep_agent(self, agent: OnnxPolicy, figures: validation.Validation) -> None:
+        """Put an agent with its figures into the next checkpoint."""
+        contract = figures.put_into(replace(agent.contract, training_steps=self.steps))
+        files = agent_files(self.folder / "agent.onnx", agent.content, contract)
+        self.files |= {path.name: content for path, content in files.items()}
+
+    def _identity(self) -> dict[str, Any]:
+        """Settings that a resumed run must share with the one that was begun; it may be longer."""
+        fields = asdict(self.recipe).items()
+        settings = {name: value for name, value in fields if name != "steps" and value not in ("", ())}
+        return {
+            "algorithm": self.recipe.name,
+            "seed": self.seed,
+            "settings": json.loads(json.dumps(settings)),
+            "plant_hash": self.recipe.config.plant_hash,
+            "scenario_hash": self.recipe.config.scenario.hash,
+        }
 
 
 class _Watch(BaseCallback):
     """Validates, saves and ends a run when it is due; called at every step, never in the middle of an update."""
 
-    def __init__(self, run: Run, bar: Any, interrupted: Callable[[], bool]) -> None:
+    def __init__(self, run: TrainingRun, bar: Any, interrupted: Callable[[], bool]) -> None:
         super().__init__()
         self.run, self.bar, self.interrupted = run, bar, interrupted
-        self.due = run.steps + run.validate_every
+        self.every = max(run.recipe.steps // 24, VALIDATE_EVERY)
+        self.due = run.steps + self.every
 
     def _on_step(self) -> bool:
         run, interrupted = self.run, self.interrupted()
         self.bar.update(run.steps - self.bar.n)
         if run.steps >= self.due:
             run.validate(self.bar)
-            self.due = run.steps + run.validate_every
-        if run.steps > run.saved_steps and (interrupted or time.monotonic() >= run.saved + run.job.checkpoint_seconds):
+            self.due = run.steps + self.every
+        if run.steps > run.saved_steps and (interrupted or time.monotonic() >= run.saved + run.checkpoint_seconds):
             run.save()
         if interrupted:
             raise KeyboardInterrupt
@@ -428,26 +360,54 @@ def deferred_interrupt() -> Iterator[Callable[[], bool]]:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-# Training seeds side by side, each a run in its own folder, in processes of this machine or on a cluster.
-
-
-def train_seed(job: Job, bar: Any = None) -> dict[str, float]:
-    """Train a seed to its end, from its checkpoint if there is one; the contents of ``summary.json``.
-
-    ``bar`` is tqdm's and counts environment steps.
-    """
-    with locked(job.folder):
-        if summary := job.summary:
-            return summary
-        run = Run(job)
-        run.learn(tqdm(disable=True) if bar is None else bar)
-        return run.finish()
-
-
-def _tried(train: Callable[[Job], dict[str, float]], job: Job) -> dict[str, float] | Exception:
-    """The summary of a seed, or the exception that ended its training: it stops no other seed."""
+def read_settings(path: Path) -> dict[str, Any]:
+    """Read ``settings.json``; AgentFileError unless a run wrote it."""
     try:
-        return train(job)
+        saved = read_json(path)
+        sound = all(type(saved[name]) is kind for name, kind in SETTINGS.items()) and 0 < saved["steps"] < 2**63
+        if not sound or not saved["sessions"] or not all(isinstance(session, dict) for session in saved["sessions"]):
+            raise KeyError
+    except (AgentFileError, KeyError, TypeError, IndexError):
+        raise AgentFileError(f"{path}: missing or damaged, so there is nothing to resume") from None
+    return dict(saved)
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Read the rows of ``progress.csv``; none without a file. AgentFileError if no run wrote it."""
+    if not path.exists():
+        return []
+    try:
+        rows = list(csv.DictReader(io.StringIO(read_bounded(path, MAX_JSON_BYTES).decode(), newline="")))
+        columns = list(validation.COLUMNS)
+        named = all(list(row)[: len(columns)] == columns for row in rows)
+        if not named or not all(math.isfinite(float(value)) for row in rows for value in row.values()):
+            raise ValueError
+    except (ValueError, TypeError, csv.Error):
+        raise AgentFileError(f"{path}: damaged; without it the run can be resumed") from None
+    return rows
+
+
+def _git_commit() -> str | None:
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        return subprocess.run(
+            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _to_json(content: Any) -> bytes:
+    return (json.dumps(content, indent=2) + "\n").encode()
+
+
+# Training seeds in parallel, each a run in its own folder, in processes of this machine or on a cluster.
+
+
+def _try_training(run: TrainingRun) -> dict[str, float] | Exception:
+    """Summary of a run, or the exception that ended it: it stops no other run."""
+    try:
+        return run.train()
     except CzError as error:
         return error
     except Exception as error:
@@ -455,42 +415,35 @@ def _tried(train: Callable[[Job], dict[str, float]], job: Job) -> dict[str, floa
         return error
 
 
-def train_seeds(jobs: Sequence[Job], bar: Any, cluster: str | None = None) -> Iterator[tuple[Job, dict[str, float]]]:
-    """Train the seeds that are not finished; yields each with its summary. ``bar`` is tqdm's and counts seeds.
+def train_seeds(
+    runs: Sequence[TrainingRun], bar: Any, cluster: str | None = None
+) -> Iterator[tuple[TrainingRun, dict[str, float]]]:
+    """Train the runs that are not finished; yields each with its summary. ``bar`` is tqdm's and counts runs.
 
     Once the others are done, CzError names the seeds that failed; any other exception of a seed is raised as it is.
     """
 
-    def look() -> None:
-        shares, lines = zip(*map(_standing, jobs), strict=True)
+    def poll_progress() -> None:
+        shares, lines = zip(*(run.poll_progress() for run in runs), strict=True)
         bar.set_postfix_str("  ".join(lines), refresh=False)
         bar.update(sum(shares) - bar.n)
 
-    missing, failed = list[Job](), dict[int, Exception]()
-    for job in jobs:
-        if summary := job.summary:
-            yield job, summary
+    missing, failed = list[TrainingRun](), dict[int, Exception]()
+    for run in runs:
+        if summary := run.summary:
+            yield run, summary
         else:
-            missing.append(job)
-    shared = jobs[0].folder.parent
-    for number, result in side_by_side(partial(_tried, train_seed), missing, look, cluster, shared):
+            missing.append(run)
+    shared = runs[0].folder.parent
+    for number, result in side_by_side(_try_training, missing, poll_progress, cluster, shared):
         if isinstance(result, Exception):
             failed[missing[number].seed] = result
         else:
             yield missing[number], result
-    look()
+    poll_progress()
     for seed, error in failed.items():
         if not isinstance(error, CzError):
             error.add_note(f"seed {seed}")
             raise error
     if failed:
         raise CzError("; ".join(f"seed {seed}: {error}" for seed, error in failed.items()))
-
-
-def _standing(job: Job) -> tuple[float, str]:
-    """The share of a run that was done at its last validation [-], and a few words on it."""
-    rows = read_rows(job.folder / "progress.csv")
-    if not rows:
-        return 0.0, f"{job.seed}: 0%"
-    share = min(float(rows[-1]["steps"]) / job.recipe.steps, 1.0)
-    return share, f"{job.seed}: {share:.0%} {float(rows[-1]['validation_rmse_mm']):.3f} mm"

@@ -17,7 +17,7 @@ from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 
 from .contract import Contract
-from .recipes import Recipe
+from .recipes import TrainingConfig
 
 Floats = npt.NDArray[np.float64]
 PICKING = VALIDATION_SEEDS[:64]
@@ -30,7 +30,7 @@ REFERENCES = {"Cz-v0": ("paper", "paper-tuned", "lqg"), "CzCrystal-v0": ("compen
 References = Mapping[str, tuple[float, float]]
 """Mean RMSE of each reference [mm], on the crystals of PICKING and of JUDGING."""
 COLUMNS = "steps", "seconds", "validation_cost", "validation_rmse_mm", "pull_step_rms_mm_per_min", "failure_rate"
-"""Figures of a validation; :func:`beside` names those of the references, which follow, the same in every row."""
+"""Figures of a validation; those of the references follow, the same in every row (:func:`reference_column`)."""
 
 
 class Validation(NamedTuple):
@@ -47,8 +47,8 @@ class Validation(NamedTuple):
         return replace(contract, validation_cost=self.cost, validation_rmse_mm=self.rmse_mm)
 
 
-def beside(name: str) -> str:
-    """Name of the column with the RMSE of a reference [mm]."""
+def reference_column(name: str) -> str:
+    """Name the column with the RMSE of a reference controller [mm]."""
     return f"{name}_rmse_mm"
 
 
@@ -59,7 +59,7 @@ def validate(policy: Any, config: Config, seeds: Sequence[int]) -> Validation:
     return Validation(*(float(figure.mean()) for figure in figures))
 
 
-def references(make_controller: Callable[[str, Config], Any], recipe: Recipe) -> References:
+def references(make_controller: Callable[[str, Config], Any], recipe: TrainingConfig) -> References:
     """RMSEs of the classical controllers on the crystals of a recipe; ``make_controller`` makes one by its name."""
     config = replace(recipe.config, observation="measured", action="direct")
 

@@ -2,10 +2,10 @@
 
 from typing import Any
 
-from cz_gym.agents import train, validation
+from cz_gym.agents import validation
 from cz_gym.agents.asymmetric import LearnState
-from cz_gym.agents.recipes import APG, PPO, SAC, Recipe, make_algorithm, repeat_of
-from cz_gym.agents.train import Job
+from cz_gym.agents.recipes import APG, PPO, SAC, TrainingConfig, make_algorithm, repeat_of
+from cz_gym.agents.train import TrainingRun
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
 SMALL = PPO(num_envs=4, action_repeat=2, hidden=(16, 16), steps=128, n_steps=16, batch_size=32, n_epochs=1)
@@ -16,21 +16,27 @@ SMALL_APG = APG(num_envs=4, window=20, steps=160)
 QUICK = PPO(num_envs=64, action_repeat=2, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,), fewest_updates=1)
 """For runs of ``train.py``."""
 REFERENCES = dict.fromkeys(validation.REFERENCES["Cz-v0"], (0.2, 0.1))
-TRAIN_SEED = train.train_seed
+TRAIN = TrainingRun.train
 
 
-def train_small_seed(job: Job, bar: Any = None) -> dict[str, float]:
-    """:func:`fleet.train_seed` with few validation episodes, in any process."""
+def train_small(run: TrainingRun, bar: Any = None) -> dict[str, float]:
+    """:meth:`TrainingRun.train` with few validation episodes."""
     validation.PICKING, validation.JUDGING = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]
-    return TRAIN_SEED(job, bar)
+    return TRAIN(run, bar)
 
 
-def learned(algorithm: Any, recipe: Recipe) -> Any:
+class SmallRun(TrainingRun):
+    """A run with few validation episodes, in any process."""
+
+    train = train_small
+
+
+def learned(algorithm: Any, recipe: TrainingConfig) -> Any:
     """The algorithm after what is left of the recipe's steps, as a run lets it learn."""
     left = recipe.steps // repeat_of(recipe) - algorithm.num_timesteps
     fits = [LearnState()] if isinstance(recipe, PPO) else None
     return algorithm.learn(left, fits, reset_num_timesteps=False)
 
 
-def trained(recipe: Recipe, seed: int = 0) -> Any:
+def trained(recipe: TrainingConfig, seed: int = 0) -> Any:
     return learned(make_algorithm(recipe, seed), recipe)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from cz_gym.agents.recipes import CRYSTAL, CRYSTAL_RECIPES, CZ, DEFAULT, FEW_UPDATES, RECIPES, Recipe
+from cz_gym.agents.recipes import CRYSTAL, CRYSTAL_RECIPES, CZ, DEFAULT, FEW_UPDATES, RECIPES, TrainingConfig
 from cz_gym.agents.train import read_settings
 from cz_gym.config import check_config
 from cz_gym.puller.file import chosen_puller
@@ -40,7 +40,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     add("--out", type=Path, help=about)
     parser.add_cluster()
     add("--plot", action="store_true", help="draw the progress into the run folder: progress.png")
-    add("--resume", action="store_true", help="continue from the run folder's checkpoint; sac with a new replay buffer")
+    about = "go on from the folder's last checkpoint, not bit for bit as without a stop; sac with a new replay buffer"
+    add("--resume", action="store_true", help=about)
     about = "time between checkpoints: the most that a crash loses (default: %(default)s)"
     add("--checkpoint-seconds", type=between(0, 10**6), default=60, metavar="S", help=about)
     arguments = parser.parse_args(argv)
@@ -68,7 +69,7 @@ def train(arguments: argparse.Namespace) -> int:
         import matplotlib  # noqa: F401  # if it is missing, say so before the training
     from tqdm import tqdm
 
-    from cz_gym.agents.train import Job, train_seed, train_seeds
+    from cz_gym.agents.train import TrainingRun, train_seeds
     from cz_gym.agents.validation import references
 
     folders = [arguments.out.resolve() / f"seed{seed}" for seed in arguments.seeds or ()] or [arguments.out]
@@ -79,38 +80,38 @@ def train(arguments: argparse.Namespace) -> int:
             pass  # if another process has it, say so before the training
     options = references(make_controller, recipe), arguments.checkpoint_seconds, arguments.plot
     seeds = arguments.seeds or [seed]
-    jobs = [Job(folder, recipe, seed, *options) for folder, seed in zip(folders, seeds, strict=True)]
-    what = f"{len(jobs)} seeds" if arguments.seeds else f"seed {seed}, {recipe.steps:,} steps"
+    runs = [TrainingRun(folder, recipe, seed, *options) for folder, seed in zip(folders, seeds, strict=True)]
+    amount = f"{len(runs)} seeds" if arguments.seeds else f"seed {seed}, {recipe.steps:,} steps"
     machine = f", puller {recipe.config.puller.label}" if recipe.puller else ""
     if recipe.updates < FEW_UPDATES:
         print(f"{recipe.steps:,} steps are {recipe.updates} updates of {recipe.name}: too few to learn from")
     where = f"{recipe.environment} ({', '.join(recipe.stages)}), " if recipe.environment else ""
-    print(f"{recipe.name}, {what} on {where}{recipe.config.scenario.name}{machine}, into {arguments.out}")
+    print(f"{recipe.name}, {amount} on {where}{recipe.config.scenario.name}{machine}, into {arguments.out}")
     if not arguments.seeds:
         with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, disable=None) as bar:
-            summary = train_seed(jobs[0], bar)
+            summary = runs[0].train(bar)
         print(f"{_summary_line(summary)}\nwrote {arguments.out / 'agent.onnx'}")
         return 0
-    form = "{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
-    with tqdm(total=len(jobs), bar_format=form, disable=None) as bar:
-        for job, summary in train_seeds(jobs, bar, arguments.cluster):
-            bar.write(f"seed {job.seed}: {_summary_line(summary)}")
-    print(f"wrote agent.onnx into {len(jobs)} folders of {arguments.out}")
+    layout = "{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+    with tqdm(total=len(runs), bar_format=layout, disable=None) as bar:
+        for run, summary in train_seeds(runs, bar, arguments.cluster):
+            bar.write(f"seed {run.seed}: {_summary_line(summary)}")
+    print(f"wrote agent.onnx into {len(runs)} folders of {arguments.out}")
     return 0
 
 
 def _summary_line(summary: dict[str, float]) -> str:
     ends = "_rmse_mm"
-    beside = {name.removesuffix(ends): value for name, value in summary.items() if name.endswith(ends)}
+    errors = {name.removesuffix(ends): value for name, value in summary.items() if name.endswith(ends)}
     return (
         f"best agent on {summary['validation_episodes']} validation episodes: mean RMSE "
-        f"{beside.pop('validation'):.3f} mm, {100 * summary['failure_rate']:.1f} % lost; beside it "
-        + ", ".join(f"{name} {value:.3f}" for name, value in beside.items())
+        f"{errors.pop('validation'):.3f} mm, {100 * summary['failure_rate']:.1f} % lost; beside it "
+        + ", ".join(f"{name} {value:.3f}" for name, value in errors.items())
     )
 
 
-def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tuple[Recipe, int]:
-    """Recipe and training seed of the command line, or of the first resumed run; CzError if none may resume."""
+def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tuple[TrainingConfig, int]:
+    """TrainingConfig and training seed of the command line, or of the first resumed run; CzError if none may resume."""
     begun = [folder for folder in folders if (folder / "settings.json").exists()]
     if begun and not arguments.resume:
         raise CzError(f"{begun[0]} holds a run already: --resume it, or name another --out")

@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
 from cz_gym.agents.contract import make_contract, read_agent
-from cz_gym.agents.train import PROGRESS, load_checkpoint, read_rows, read_settings, restore, to_bytes
+from cz_gym.agents.train import load_checkpoint, read_rows, read_settings, restore, to_bytes
 from cz_gym.agents.validation import COLUMNS
 
 SPARE = 1_000_000_000
@@ -58,7 +59,7 @@ def known(ppo, tmp_path_factory):
         return Target(seed, lambda content: ((folder / name).write_bytes(content), read(folder / name)))
 
     def restored(path):
-        restore(ppo, *load_checkpoint(path)[:2], path)
+        restore(ppo, load_checkpoint(path), path)
 
     targets = {
         "agent.onnx": Target(network, lambda content: OnnxPolicy.of(make_contract(content, **facts), content)),
@@ -116,20 +117,29 @@ def odd_json(draw, seed):
 
 
 @st.composite
-def odd_archive(draw, seed):
-    """A checkpoint of which one member is another, with the right check sum."""
+def odd_checkpoint(draw, seed):
+    """A checkpoint with odd members, or of which one part is damaged, with the right check sum."""
+    content = torch.load(io.BytesIO(seed), weights_only=True)
+    if draw(st.booleans()):
+        for _ in range(draw(st.integers(1, 3))):
+            part = draw(
+                st.sampled_from([content, *(each for each in content.values() if isinstance(each, dict) and each)])
+            )
+            part[draw(st.sampled_from([*part, "surprise"]))] = draw(VALUES)
+        torch.save(content, file := io.BytesIO())
+        return file.getvalue()
     with zipfile.ZipFile(io.BytesIO(seed)) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
-    name = draw(st.sampled_from([PROGRESS, "policy.pth", "policy.optimizer.pth"]))
-    members[name] = draw((odd_json if name == PROGRESS else odd_bytes)(members[name]))
-    with zipfile.ZipFile(content := io.BytesIO(), "w") as archive:
+    name = draw(st.sampled_from(sorted(members)))
+    members[name] = draw(odd_bytes(members[name]))
+    with zipfile.ZipFile(file := io.BytesIO(), "w") as archive:
         for name, member in members.items():
             archive.writestr(name, member)
-    return content.getvalue()
+    return file.getvalue()
 
 
 MUTANTS = {
-    "agent.onnx": odd_bytes, "agent.json": odd_json, "checkpoint": odd_archive, "settings.json": odd_json,
+    "agent.onnx": odd_bytes, "agent.json": odd_json, "checkpoint": odd_checkpoint, "settings.json": odd_json,
     "progress.csv": odd_bytes,
 }  # fmt: skip
 

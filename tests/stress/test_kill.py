@@ -26,7 +26,7 @@ from tests.small_learners import QUICK
 
 FRESH = multiprocessing.get_context("forkserver")
 FRESH.set_forkserver_preload(["tests.stress.test_kill"])
-RUN = "cz_gym.agents.train:Run"
+RUN = "cz_gym.agents.train:TrainingRun"
 PHASES = {
     "rollout": ("stable_baselines3.common.buffers:RolloutBuffer.add:20", 1280),
     "update": ("stable_baselines3:PPO.train:1>torch.nn.utils:clip_grad_norm_:5", 3328),
@@ -86,7 +86,7 @@ def is_torn(folder):
     """Whether a file is older than the checkpoint; all are written anew, as a resumed run does first."""
     if not (folder / run.CHECKPOINT).exists():
         return False
-    files = {folder / name: content for name, content in load_checkpoint(folder / run.CHECKPOINT)[2].items()}
+    files = {folder / name: content for name, content in load_checkpoint(folder / run.CHECKPOINT).files.items()}
     torn = any(not file.exists() or file.read_bytes() != content for file, content in files.items())
     write_files(files)
     return torn
@@ -97,16 +97,16 @@ def reached(out):
     if not (out / run.CHECKPOINT).exists():
         assert not (out / "settings.json").exists(), "settings without a checkpoint"
         return 0
-    progress, *_ = load_checkpoint(out / run.CHECKPOINT)
+    checkpoint = load_checkpoint(out / run.CHECKPOINT)
     file, summary = out / "progress.csv", out / "summary.json"
     rows = list(csv.DictReader(file.read_text().splitlines())) if file.exists() else []
     best = min((float(row["validation_cost"]) for row in rows), default=None)
-    assert best == progress.best_cost
+    assert best == checkpoint.best_cost
     if best is not None:
         found = {float(row["validation_rmse_mm"]) for row in rows if float(row["validation_cost"]) == best}
         found |= {json.loads(summary.read_text())["validation_rmse_mm"]} if summary.exists() else set()
         assert OnnxPolicy.load(out / "agent.onnx").contract.validation_rmse_mm in found, "not the best agent"
-    return progress.steps
+    return checkpoint.steps
 
 
 @pytest.mark.slow

@@ -252,7 +252,7 @@ def test_hostile_graphs_stay_within_a_small_memory():
     code = (
         "import resource, sys\n"
         "import onnxruntime, onnx.checker\n"
-        "sys.path[:0] = ['.', 'tests/agents/agent_file']\n"
+        "sys.path[:0] = ['.', 'tests/agents']\n"
         "import test_graph as t\n"
         "t.policy_of(t.model_of())\n"
         "now = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"

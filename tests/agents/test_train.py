@@ -1,0 +1,312 @@
+"""Training runs: what they leave, that they go on where they stopped, and answer mistakes in one line."""
+
+import csv
+import io
+import itertools
+import json
+import math
+import os
+import signal
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+from tqdm import tqdm
+
+from cz_gym.agents import AgentFileError, OnnxPolicy, load, validation
+from cz_gym.agents import train as training
+from cz_gym.agents.recipes import CRYSTAL_RECIPES, RECIPES, make_algorithm
+from cz_gym.agents.train import CHECKPOINT, TrainingRun, load_checkpoint, restore, to_bytes
+from cz_gym.config import make_config
+from cz_gym.support.command_line import interpreter
+from cz_gym.tools import train
+from tests.small_learners import QUICK, REFERENCES, SMALL, SMALL_APG, SMALL_SAC, SmallRun, learned, train_small, trained
+
+ALONG = {name: getattr(CRYSTAL_RECIPES["ppo"], name) for name in ("environment", "stages", "scenario")}
+SMALL_PPO = replace(QUICK, steps=4096, control_interval=30.0)
+
+
+def resume(learner, other, path):
+    """Have another algorithm go on from a checkpoint of the first, which it returns."""
+    path.write_bytes(to_bytes(learner, 12.0, 0.5))
+    checkpoint = load_checkpoint(path)
+    restore(other, checkpoint, path)
+    return checkpoint
+
+
+def test_a_checkpoint_continues_and_refuses_what_does_not_fit(ppo, tmp_path):
+    path, files = tmp_path / CHECKPOINT, {"agent.onnx": b"network\x00\xff"}
+    other = make_algorithm(SMALL, 1, 128)
+    checkpoint = resume(ppo, other, path)
+    assert checkpoint[:3] == (128, 12.0, 0.5), "not environment steps"
+    assert checkpoint.returns[2] > 60, "returns that rewards are normalised with"
+    again = to_bytes(other, 12.0, 0.5, files)
+    path.write_bytes(again)
+    assert load_checkpoint(path).files == files
+    assert load_checkpoint(path)[:4] == checkpoint[:4]
+    for name, state in checkpoint.parameters.items():
+        torch.testing.assert_close(load_checkpoint(path).parameters[name], state, rtol=0.0, atol=0.0)
+    with pytest.raises(AgentFileError, match="does not fit"):
+        restore(make_algorithm(replace(SMALL, hidden=(8, 8)), 0), checkpoint, path)
+    for damaged in (again[:-100], to_bytes(other, 12.0, 0.5, {"../agent.onnx": b""})):
+        path.write_bytes(damaged)
+        with pytest.raises(AgentFileError, match="not a checkpoint of this release, or damaged"):
+            load_checkpoint(path)
+
+
+def test_weights_that_are_not_finite_are_not_saved():
+    learner = make_algorithm(SMALL, 0)
+    with torch.no_grad():
+        next(learner.policy.parameters()).fill_(math.nan)
+    with pytest.raises(AgentFileError, match="went wrong: a weight is not finite; the last checkpoint stays"):
+        to_bytes(learner, 1.0, None)
+
+
+@pytest.mark.parametrize("recipe", [SMALL, SMALL_APG], ids=lambda recipe: recipe.name)
+def test_an_algorithm_restored_before_its_first_update_learns_as_the_one_it_came_from(recipe, tmp_path):
+    first, second, unsaved = (make_algorithm(recipe, 0) for _ in range(3))
+    resume(first, second, tmp_path / CHECKPOINT)
+    for algorithm in (first, second, unsaved):
+        algorithm.set_random_seed(3)
+        learned(algorithm, recipe)
+    parameters = [torch.cat([each.flatten() for each in one.policy.parameters()]) for one in (first, second, unsaved)]
+    assert all(torch.equal(each, parameters[0]) for each in parameters)
+
+
+def test_a_resumed_sac_keeps_its_temperature_and_fills_a_new_replay_buffer_before_it_learns(tmp_path):
+    """stable-baselines3 counts the temperature as a variable, not among the parameters."""
+    learner, other = trained(SMALL_SAC), make_algorithm(SMALL_SAC, 0, 256)
+    with torch.no_grad():
+        learner.log_ent_coef.fill_(-1.25)
+    assert resume(learner, other, tmp_path / CHECKPOINT).steps == 256
+    assert other.log_ent_coef.item() == -1.25
+    assert other.log_ent_coef in other.ent_coef_optimizer.param_groups[0]["params"]
+    learned(other, replace(SMALL_SAC, steps=256 + 4 * 32))
+    assert (other.replay_buffer.size() * 4, other._n_updates) == (32, 0)
+    learned(other, replace(SMALL_SAC, steps=256 + 4 * 36))
+    assert other._n_updates == 1
+
+
+@pytest.fixture
+def quick(monkeypatch, few_crystals):
+    monkeypatch.setitem(RECIPES, "ppo", QUICK)
+    monkeypatch.setitem(CRYSTAL_RECIPES, "ppo", replace(QUICK, name="ppo-along", **ALONG))
+    for recipes in (RECIPES, CRYSTAL_RECIPES):
+        monkeypatch.setitem(recipes, "gradient", replace(recipes["gradient"], num_envs=64, window=12))
+
+
+def rows(folder):
+    return list(csv.DictReader((folder / "progress.csv").read_text().splitlines()))
+
+
+def content(path):
+    return json.loads(path.read_text())
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("algorithm", [pytest.param("gradient", marks=pytest.mark.slow), "ppo"])
+def test_a_run_leaves_everything_and_goes_on(algorithm, tmp_path, capsys):
+    folder = tmp_path / "run"
+    assert train.main(["--algo", algorithm, "--steps", "9000", "--seed", "3", "--out", str(folder), "--plot"]) == 0
+    crystals = "0.175 hard + 0.175 hot-zone + 0.175 puller + 0.3 randomized + 0.175 sensor-fault"
+    assert f" steps on {crystals}, into {folder}\n" in capsys.readouterr().out
+    assert (folder / "progress.png").read_bytes().startswith(b"\x89PNG")
+    saved = content(folder / "settings.json")
+    assert saved["seed"] == 3
+    assert saved["settings"]["scenario"] == RECIPES[algorithm].scenario
+    assert saved["packages"]["stable-baselines3"]
+    assert {"command", "git_commit", "plant_hash", "scenario_hash"} <= set(saved)
+    policy = OnnxPolicy.load(folder / "agent.onnx")
+    assert policy.contract.training_seed == 3
+    summary, before = content(folder / "summary.json"), rows(folder)
+    assert policy.contract.validation_cost == summary["validation_cost"]
+    assert policy.contract.validation_rmse_mm == summary["validation_rmse_mm"]
+    picked_by = {float(row["validation_rmse_mm"]) for row in before}
+    assert summary["validation_rmse_mm"] not in picked_by, "judged as it was picked"
+    assert list((folder / "tensorboard").rglob("events.*"))
+    assert float(before[-1]["paper_rmse_mm"]) > float(before[-1]["lqg_rmse_mm"]) > 0
+    assert train.main(["--resume", "--out", str(folder)]) == 0, "nothing was left to learn"
+    assert rows(folder) == before
+    assert train.main(["--algo", algorithm, "--out", str(folder)]) == 2
+    assert "--resume" in capsys.readouterr().err
+    assert train.main(["--algo", algorithm, "--steps", "18000", "--seed", "3", "--resume", "--out", str(folder)]) == 0
+    after = rows(folder)
+    assert after[: len(before)] == before
+    assert int(after[-1]["steps"]) >= 18000 > int(before[-1]["steps"])
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("algorithm", CRYSTAL_RECIPES)
+def test_a_run_on_whole_crystals_goes_on_and_its_agent_is_for_these(algorithm, tmp_path, capsys):
+    folder = tmp_path / "run"
+    assert train.main(["--env", "CzCrystal-v0", "--algo", algorithm, "--steps", "6000", "--out", str(folder)]) == 0
+    assert "on CzCrystal-v0 (crown, body, tail), 0.5 hard + 0.5 randomized, into" in capsys.readouterr().out
+    contract = OnnxPolicy.load(folder / "agent.onnx").contract
+    assert (contract.environment, contract.algorithm) == ("CzCrystal-v0", f"{algorithm}-along")
+    before = rows(folder)
+    assert list(before[-1])[-2:] == ["compensated_rmse_mm", "lqg-along_rmse_mm"]
+    assert train.main(["--resume", "--steps", "12000", "--out", str(folder)]) == 0
+    assert rows(folder)[: len(before)] == before
+    with pytest.raises(AgentFileError, match=r"agent.onnx: trained for CzCrystal-v0, not for Cz-v0$"):
+        load(folder / "agent.onnx", make_config())
+    assert train.main(["--env", "Cz-v0", "--resume", "--out", str(folder)]) == 2
+    assert f"'{algorithm}-along' is no recipe here" in capsys.readouterr().err
+
+
+@pytest.fixture
+def ctrl_c():
+    """Ctrl-C as in a terminal, also where pytest itself runs in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("quick", "ctrl_c")
+@pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
+def test_ctrl_c_in_the_middle_of_an_update_saves_after_it(tmp_path, monkeypatch, capsys):
+    """An update is four optimiser steps: two batches in each of two epochs, of which the second is interrupted."""
+    clip, calls = torch.nn.utils.clip_grad_norm_, itertools.count(1)
+
+    def interrupted(*arguments):
+        if next(calls) == 6:
+            os.kill(os.getpid(), signal.SIGINT)
+        return clip(*arguments)
+
+    monkeypatch.setitem(RECIPES, "ppo", replace(QUICK, n_epochs=2))
+    monkeypatch.setattr("torch.nn.utils.clip_grad_norm_", interrupted)
+    folder = tmp_path / "run"
+    assert train.main(["--steps", "12000", "--out", str(folder)]) == 130
+    assert f"{interpreter()} -m cz_gym train --steps 12000 --out {folder} --resume continues" in capsys.readouterr().err
+    checkpoint = load_checkpoint(folder / CHECKPOINT)
+    assert 2 * 4096 < checkpoint.steps < 3 * 4096
+    assert float(checkpoint.parameters["policy.optimizer"]["state"][0]["step"]) == 8.0
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--seeds", "9-0"], "must be FIRST-LAST"),
+        (["--seeds", "0-99999999999"], "at most 1000 seeds"),
+        (["--steps", "0"], "between 1 and 1000000000000, not 0"),
+        (["--checkpoint-seconds", "nan"], "between 0 and 1000000, not nan"),
+        (["--sceanrio", "hard"], "unrecognized arguments"),
+        (["--scenario", "quiet"], "unknown scenario 'quiet'"),
+        (["--scenario", "hard=much"], "'hard=much' is no scenario with its share"),
+        (["--scenario", "none.py:quiet"], "none.py: no such file"),
+        (["--resume"], "nothing to resume"),
+        (["--env", "CzCrystal-v0", "--algo", "sac"], "'sac' is no recipe here: name one of ppo, gradient by --algo"),
+    ],
+)
+def test_a_wrong_command_is_refused_in_one_line(tmp_path, arguments, message, refused):
+    assert message in refused(train.main, [*arguments, "--out", str(tmp_path / "run")])
+    assert not (tmp_path / "run").exists()
+
+
+# Training seeds in parallel come out as one by one, and nothing is lost or done twice.
+
+
+def in_turn(function, tasks, poll_progress, *cluster):
+    for number, task in enumerate(tasks):
+        yield number, function(task)
+        poll_progress()
+
+
+@pytest.fixture
+def seeds(monkeypatch, few_crystals):
+    """Small runs in this process; the seeds that were trained, in turn."""
+    seeds = []
+
+    def counted(run, bar=None):
+        seeds.append(run.seed)
+        return train_small(run, bar)
+
+    monkeypatch.setattr(TrainingRun, "train", counted)
+    monkeypatch.setattr(training, "side_by_side", in_turn)
+    monkeypatch.setattr(validation, "references", lambda *_: REFERENCES)
+    monkeypatch.setitem(RECIPES, "ppo", SMALL_PPO)
+    return seeds
+
+
+def agents(folder):
+    return {path.parent.name: path.read_bytes() for path in sorted(folder.glob("*/agent.onnx"))}
+
+
+def sessions(folder):
+    """How often each seed's run was begun or resumed."""
+    return [len(content(path)["sessions"]) for path in sorted(folder.glob("*/settings.json"))]
+
+
+def test_seeds_come_out_as_one_by_one_and_only_once(seeds, tmp_path, capsys):
+    several, one = tmp_path / "several", tmp_path / "one"
+    assert train.main(["--algo", "ppo", "--seeds", "3-4", "--out", str(several)]) == 0
+    assert "seed 4: best agent on 2 validation episodes" in capsys.readouterr().out
+    assert train.main(["--algo", "ppo", "--seed", "4", "--out", str(one)]) == 0
+    found = agents(several)
+    assert list(found) == ["seed3", "seed4"]
+    assert found["seed4"] == (one / "agent.onnx").read_bytes() != found["seed3"]
+    assert train.main(["--resume", "--seeds", "2-4", "--out", str(several)]) == 0, "the folder knows the recipe"
+    assert seeds == [3, 4, 4, 2]
+    assert sessions(several) == [1, 1, 1]
+    assert train.main(["--seeds", "4-5", "--out", str(several)]) == 2
+    assert "seed4 holds a run already" in capsys.readouterr().err
+    assert train.main(["--resume", "--seeds", "4-5", "--scenario", "hard", "--out", str(several)]) == 2
+    assert "begun with another settings" in capsys.readouterr().err
+
+
+def test_an_unfinished_seed_goes_on_and_longer_runs_do_too(seeds, tmp_path, monkeypatch):
+    finish = TrainingRun.finish
+
+    def killed(self):
+        if self.seed == 1:
+            raise AgentFileError("killed")
+        return finish(self)
+
+    command = ["--algo", "ppo", "--seeds", "0-1", "--out", str(tmp_path)]
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingRun, "finish", killed)
+        assert train.main(command) == 2
+    assert not (tmp_path / "seed1" / "summary.json").exists()
+    assert train.main([*command, "--resume"]) == 0
+    assert seeds == [0, 1, 1]
+    assert sessions(tmp_path) == [1, 2]
+    assert content(tmp_path / "seed1" / "settings.json")["sessions"][1]["from_step"] == 4096
+    assert train.main([*command, "--resume", "--steps", "6144"]) == 0
+    assert seeds == [0, 1, 1, 0, 1]
+
+
+@pytest.mark.parametrize("error", [AgentFileError("the training went wrong"), ValueError("could not be broadcast")])
+def test_one_seed_that_fails_stops_no_other(error, tmp_path, monkeypatch, seeds, capsys):
+    """An error that the project raises on purpose is one line; any other one is raised with its traceback."""
+
+    def failing(run):
+        if run.seed == 1:
+            raise error
+        return train_small(run)
+
+    monkeypatch.setattr(TrainingRun, "train", failing)
+    command = ["--algo", "ppo", "--seeds", "0-2", "--out", str(tmp_path)]
+    if isinstance(error, AgentFileError):
+        assert train.main(command) == 2
+        assert capsys.readouterr().err.splitlines()[-1] == "cz-gym train: seed 1: the training went wrong"
+    else:
+        with pytest.raises(ValueError, match="could not be broadcast") as caught:
+            train.main(command)
+        notes = "".join(caught.value.__notes__)
+        assert "in failing" in notes
+        assert "seed 1" in notes
+    assert sorted(agents(tmp_path)) == ["seed0", "seed2"]
+
+
+@pytest.mark.slow
+def test_processes_train_the_same(tmp_path, monkeypatch):
+    """And the bar counts them all."""
+    for place in (tmp_path / "there", tmp_path / "here"):
+        runs = [SmallRun(place / f"seed{seed}", SMALL_PPO, seed, REFERENCES) for seed in range(3)]
+        with tqdm(total=3, file=io.StringIO()) as bar:
+            assert {run.seed for run, _ in training.train_seeds(runs, bar)} == {0, 1, 2}
+            assert bar.n == pytest.approx(3)
+        monkeypatch.setattr(training, "side_by_side", in_turn)
+    assert agents(tmp_path / "there") == agents(tmp_path / "here")
