@@ -24,8 +24,6 @@ from cz_gym.agents.contract import make_contract
 from cz_gym.agents.export import to_onnx
 from cz_gym.config import make_config
 from cz_gym.spaces import HISTORY
-from cz_gym.tools.export.controllers import network_of
-from cz_gym.tools.export.trace import Graph
 from tests.contracts import facts
 
 pytestmark = pytest.mark.usefixtures("few_crystals")
@@ -110,34 +108,19 @@ def test_the_command_reads_analytic_policy_gradients_of_a_mixture(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["ppo", "sac"])
-def test_a_model_without_its_normalisation_is_refused(kind, tmp_path):
-    """A model that was saved and loaded has no environment that could tell, or a plain one that it was loaded into."""
-    config = make_config(control_interval=10.0)
-    normalised, plain = trained(kind, normalised=True), trained(kind)
-
-    def again(model, env):
-        model.save(tmp_path / "model.zip")
-        return type(model).load(tmp_path / "model.zip", env=env, device="cpu")
-
-    for env in (None, plain.get_env()) if kind == "ppo" else (None,):
-        with pytest.raises(AgentFileError, match=r"trained on normalised observations: .*--vecnormalize"):
-            from_sb3.save_agent(tmp_path / "mine.onnx", again(normalised, env), "mine", config=config)
-        from_sb3.save_agent(str(tmp_path / "mine.onnx"), again(plain, env), "mine", config=config)
-    if kind == "sac":
-        with pytest.raises(AgentFileError, match=r"does not tell .*: load it without env and give config"):
-            from_sb3.save_agent(tmp_path / "mine.onnx", again(plain, plain.get_env()), "mine")
-        from_sb3.save_agent(tmp_path / "mine.onnx", trained(kind, observation="state"), "mine")  # it has no flag
-    environment = normalised.get_vec_normalize_env()
-    from_sb3.save_agent(tmp_path / "mine.onnx", again(normalised, None), "mine", environment, config)
-
-
-def test_a_model_that_does_not_know_its_training_is_written_with_a_warning(tmp_path):
-    model = trained("ppo")
+def test_a_model_in_no_environment_is_written_by_settings_that_are_given(kind, tmp_path):
+    path, model, config = tmp_path / "mine.onnx", trained(kind, normalised=True), make_config(control_interval=10.0)
+    normalisation = model.get_vec_normalize_env()
     model.save(tmp_path / "model.zip")
-    unknown = PPO("MlpPolicy", model.get_env(), device="cpu", **ON)
-    unknown.set_parameters(tmp_path / "model.zip")
-    with pytest.warns(UserWarning, match="does not know how it was trained: if on normalised"):
-        from_sb3.save_agent(tmp_path / "mine.onnx", unknown, "mine")
+    loaded = type(model).load(tmp_path / "model.zip", device="cpu")
+    with pytest.raises(AgentFileError, match=r"in no environment of .*: say in which it was trained \(config\)"):
+        from_sb3.save_agent(path, loaded, "mine", normalisation)
+    with pytest.raises(AgentFileError, match=r"in no environment: say by normalisation .*, or False"):
+        from_sb3.save_agent(path, loaded, "mine", config=config)
+    from_sb3.save_agent(path, loaded, "mine", normalisation, config)
+    assert from_sb3.disagreement(OnnxPolicy.load(path), model, normalisation, config) < 1e-4
+    from_sb3.save_agent(str(path), loaded, "mine", False, config)
+    assert from_sb3.disagreement(OnnxPolicy.load(path), model, None, config) < 1e-4
 
 
 def in_environments(*wrapped, outer=lambda env: env, **options):
@@ -212,8 +195,7 @@ LAYERS = {
 
 
 @pytest.mark.parametrize("layer", LAYERS)
-def test_usual_layers_act_alike_in_torch_in_the_file_and_in_its_export(layer, tmp_path):
-    """The export to other languages records the same graph in NumPy, in double precision."""
+def test_usual_layers_act_alike_in_torch_and_in_the_file(layer):
     arch = {"activation_fn": LAYERS[layer], "net_arch": [8]}
     policy = PPO("MlpPolicy", "Cz-v0", seed=0, device="cpu", n_steps=8, batch_size=8, policy_kwargs=arch).policy
     with torch.no_grad():
@@ -224,9 +206,6 @@ def test_usual_layers_act_alike_in_torch_in_the_file_and_in_its_export(layer, tm
     wanted = policy.predict(seen, deterministic=True)[0]
     assert np.abs(wanted).max() > 0.2
     assert agent.predict(seen)[0] == pytest.approx(wanted, abs=1e-5)
-    network = network_of(content)
-    assert network(observation=seen.astype(np.float64))[0] == pytest.approx(wanted, abs=1e-5)
-    assert network(observation=Graph().input("observation", (1, 73)))[0].shape == (1, 2)
 
 
 def test_a_file_that_would_act_otherwise_is_not_written(tmp_path):
