@@ -1,11 +1,14 @@
-"""Colours of the pictures: Okabe and Ito's where a colour has a meaning, safe for colour-blind readers."""
+"""A canvas of shapes and text for pygame, and its colours: Okabe and Ito's, safe for colour-blind readers.
+
+pygame draws at twice the picture's resolution, so that the mean of the drawn pixels has smooth edges.
+"""
 
 import contextlib
 import importlib
 import importlib.util
 import io
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,14 +24,11 @@ PANEL: Colour = (22, 27, 36)
 RIM: Colour = (56, 66, 82)
 INK: Colour = (236, 239, 244)
 FAINT: Colour = (150, 160, 176)
-BAND: Colour = (38, 50, 62)
 
 TRUE: Colour = (86, 180, 233)
 """The true crystal."""
 CAMERA: Colour = (240, 228, 66)
 """The bright ring, and the radius that the camera reads from it."""
-NOISE: Colour = (142, 138, 52)
-"""The camera's line in the chart, dim since its noise fills an area."""
 REFERENCE: Colour = (255, 255, 255)
 DRIVE: Colour = (204, 121, 167)
 """Pull speed and heater."""
@@ -41,9 +41,6 @@ MELT: Colour = (242, 138, 66)
 ON_MELT: Colour = (60, 20, 0)
 """Words on the bright melt."""
 CRYSTAL: Colour = (104, 112, 128)
-
-
-# A canvas of shapes and text: pygame draws at twice the picture's resolution, so that its mean has smooth edges.
 
 Frame = npt.NDArray[np.uint8]
 MISSING = 'rendering needs pygame: pip install ".[render]"'
@@ -109,11 +106,9 @@ class Canvas:
         self.box = Box(0.0, 0.0, width / self.unit, height / self.unit)
         self._fine = self.pygame.Surface((FINE * width, FINE * height), 0, 32)
 
-    def begin(self, *panels: Box) -> None:
-        """Begin a new picture with these panels on it."""
+    def begin(self) -> None:
+        """Begin a new picture."""
         self._fine.fill(BACK)
-        for box in panels:
-            self.rectangle(PANEL, box)
 
     def finish(self) -> Frame:
         """The picture, shape (height, width, 3), an array of the caller's own."""
@@ -173,11 +168,6 @@ class Canvas:
         points[:, 0], points[:, 1] = x, y
         fine: list[list[float]] = np.clip(points * (self.unit * FINE), -FAR, FAR).tolist()
         return fine
-
-
-def first_at_least(value: float, steps: Sequence[float]) -> float:
-    """The first of increasing steps that is at least a value, or the last."""
-    return next((step for step in steps if step >= value), steps[-1])
 
 
 @lru_cache(maxsize=8)

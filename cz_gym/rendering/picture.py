@@ -1,4 +1,8 @@
-"""The samples of one episode so far, from which its pictures are drawn."""
+"""The picture of a growing crystal: an episode's record, the triple point to scale, and the numbers beside it.
+
+The triple point is where crystal, melt and gas meet. Above it stands the surface that has grown, beside the reference:
+the history of the radius, drawn at the size that it has.
+"""
 
 import math
 from enum import Enum
@@ -9,14 +13,13 @@ import numpy.typing as npt
 
 from cz_gym.config import Config
 from cz_gym.crystal import recipe
-from cz_gym.crystal import recipe as task
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.physics.meniscus import MeniscusModel, profile, profile_scale
 from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, Puller
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from . import canvas as palette
-from .canvas import Box, Canvas, Colour, Frame, first_at_least
+from .canvas import Box, Canvas, Colour, Frame
 
 DRAWN = frozenset({"r_c", "r_ref", "r_br", "r_br_measured", "h_c", "v_p", "Q_H", "T_1", "T_1_ref", "T_b"})
 """Rows of ``info`` that a picture shows; a process without them has none."""
@@ -157,7 +160,7 @@ class CrystalRecord(Record):
     @property
     def lowest(self) -> float:
         """Lowest meniscus before it freezes [m]."""
-        return task.HEIGHT_MIN
+        return recipe.HEIGHT_MIN
 
     @property
     def length(self) -> Floats:
@@ -168,7 +171,7 @@ class CrystalRecord(Record):
         if self.last("succeeded") > 0.0:
             return Ending.DONE
         at = self.config.process.Logged(*self._samples[self._count - 1, :-1])
-        rooms = task.room(at, self.config.radius_limit, self.config.parameters)
+        rooms = recipe.room(at, self.config.radius_limit, self.config.parameters)
         return (Ending.FROZEN, Ending.DETACHED, Ending.LOST, Ending.COLD)[int(np.argmin(rooms))]
 
 
@@ -289,7 +292,7 @@ def _draw_axis(canvas: Canvas, box: Box, scale: Scale) -> None:
     """Radii in mm along the lower edge."""
     y, per_mm = box.bottom - 16, scale.per_metre * MM
     canvas.rectangle(palette.PANEL, Box(box.x, y, box.w, 16.0))
-    step = first_at_least(box.w / per_mm / 9.0, (5.0, 10.0, 20.0, 50.0))
+    step = next((step for step in (5.0, 10.0, 20.0) if step >= box.w / per_mm / 9.0), 50.0)
     first, last = ((x - scale.x_0) / per_mm / step for x in (box.x, box.right))
     for number in range(math.ceil(first), math.floor(last) + 1):
         x = scale.x_0 + number * step * per_mm
@@ -299,35 +302,7 @@ def _draw_axis(canvas: Canvas, box: Box, scale: Scale) -> None:
     canvas.text(box.right - 4, y + 4, "r [mm]", palette.FAINT, 9.0, 1.0)
 
 
-# The whole picture of one episode, in any size: the crystal's edge, numbers and the chart of the radius error.
-
-RANGES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-"""Half widths of an axis of radius errors [mm]."""
-TOLERANCE = 0.5 * MM
-"""Half width of the shaded band around no error [m]: the benchmark's tolerance."""
-TICKS = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0)
-"""Steps of the time axis [min]."""
-MARGINS = (38.0, 18.0, 10.0, 14.0)
-"""Room for the axes' numbers and the legend: left, top, right, bottom [nominal px]."""
-
-
-class Layout(NamedTuple):
-    """The boxes of the panels."""
-
-    triple_point: Box
-    numbers: Box
-    chart: Box
-
-
-def layout(box: Box) -> Layout:
-    """The panels of a picture; the triple point gets the remaining space."""
-    top, below = 34.0, 0.24 * box.h
-    main = box.h - top - below - 12.0
-    return Layout(
-        triple_point=Box(6.0, top, box.w - 168.0, main),
-        numbers=Box(box.w - 156.0, top, 150.0, main),
-        chart=Box(6.0, top + main + 6.0, box.w - 12.0, below),
-    )
+# The whole picture, in any size: a header, the triple point, and numbers beside it.
 
 
 class Picture:
@@ -335,18 +310,21 @@ class Picture:
 
     def __init__(self, width: int, height: int) -> None:
         self.canvas = Canvas(width, height)
-        self.layout = layout(self.canvas.box)
+        self.box = self.canvas.box.inner(6.0, 34.0, 162.0, 6.0)
+        """The triple point's part of the picture."""
 
     def draw(self, record: Record) -> Frame:
         """The picture of a record's newest sample, shape (height, width, 3)."""
-        canvas, boxes = self.canvas, self.layout
-        canvas.begin(boxes.numbers, boxes.chart)
+        canvas = self.canvas
+        canvas.begin()
         _draw_header(canvas, record)
-        draw(canvas, boxes.triple_point, record)
-        _draw_numbers(canvas, boxes.numbers, record)
-        _draw_chart(canvas, boxes.chart, record)
+        draw(canvas, self.box, record)
+        _draw_numbers(canvas, self.box, record)
         if record.ending is not None:
-            _draw_ending(canvas, boxes.triple_point, record.ending)
+            band = Box(self.box.x, self.box.y + 6, self.box.w, 20)
+            fine = record.ending in (Ending.HORIZON, Ending.DONE)
+            canvas.rectangle(palette.RIM if fine else palette.ALARM, band)
+            canvas.text(band.x + band.w / 2.0, band.y + 3.5, record.ending.value, size=11, anchor=0.5, bold=True)
         return canvas.finish()
 
 
@@ -366,88 +344,30 @@ def _draw_header(canvas: Canvas, record: Record) -> None:
     canvas.text(canvas.box.right - 10, 10, status, colour, 11, 1.0, True)
 
 
-Row = tuple[str, str, Colour]
-"""Name, value and its colour."""
-
-
-def numbers(record: Record) -> list[list[Row]]:
-    """The rows of a record's newest sample; the first of each group is a signal, those below it its references."""
+def numbers(record: Record) -> list[list[tuple[str, str, Colour]]]:
+    """Names, values and colours for a record's newest sample: of each group a signal, then its reference."""
     last, (v_p, Q_H, T_b) = record.last, record.nominal
+    radius = record.camera_error[-1] + last("r_ref")
     return [
-        [_row("by the camera", record.camera_error[-1] + last("r_ref"), MM, "mm", palette.CAMERA),
-         _row("reference", last("r_ref"), MM, "mm", palette.REFERENCE)],
-        [_row("pull speed", last("v_p"), MM_PER_MIN, "mm/min", palette.DRIVE), _row("nominal", v_p, MM_PER_MIN)],
-        [_row("heater", last("Q_H"), KILO, "kW", palette.DRIVE), _row("nominal", Q_H, KILO)],
-        [_row("heater T_1", last("T_1"), 1.0, "K", palette.TEMPERATURE), _row("recipe", last("T_1_ref"))],
-        [_row("melt T_b", last("T_b"), 1.0, "K", palette.TEMPERATURE), _row("nominal", T_b)],
+        [("by the camera", f"{radius / MM:.2f} mm" if np.isfinite(radius) else "no reading", palette.CAMERA),
+         ("reference", f"{last('r_ref') / MM:.2f}", palette.REFERENCE)],
+        [("pull speed", f"{last('v_p') / MM_PER_MIN:.2f} mm/min", palette.DRIVE),
+         ("nominal", f"{v_p / MM_PER_MIN:.2f}", palette.FAINT)],
+        [("heater", f"{last('Q_H') / KILO:.2f} kW", palette.DRIVE), ("nominal", f"{Q_H / KILO:.2f}", palette.FAINT)],
+        [("heater T_1", f"{last('T_1'):.2f} K", palette.TEMPERATURE),
+         ("recipe", f"{last('T_1_ref'):.2f}", palette.FAINT)],
+        [("melt T_b", f"{last('T_b'):.2f} K", palette.TEMPERATURE), ("nominal", f"{T_b:.2f}", palette.FAINT)],
     ]  # fmt: skip
 
 
-def _row(name: str, value: float, scale: float = 1.0, unit: str = "", colour: Colour = palette.FAINT) -> Row:
-    """A row for a value in SI units; NaN is a failed reading."""
-    return name, f"{value / scale:.2f} {unit}".rstrip() if np.isfinite(value) else "no reading", colour
-
-
 def _draw_numbers(canvas: Canvas, box: Box, record: Record) -> None:
-    """The true radius error in large figures, then the groups of rows."""
-    left, right, y = box.x + 8, box.right - 8, box.y + 45
+    """The true radius error in large figures, then the groups of numbers, at the right of a panel."""
+    left, right, y = box.right + 12, canvas.box.right - 12, box.y + 45
     canvas.text(left, box.y + 5, "true radius error", palette.FAINT)
-    canvas.text(box.x + box.w / 2.0, box.y + 18, f"{record.error[-1] / MM:+.2f} mm", palette.TRUE, 19, 0.5, True)
+    canvas.text(0.5 * (left + right), box.y + 18, f"{record.error[-1] / MM:+.2f} mm", palette.TRUE, 19, 0.5, True)
     for group in numbers(record):
         for name, value, colour in group:
             canvas.text(left, y, name, palette.FAINT)
             canvas.text(right, y, value, colour, 9.5, 1.0, name == group[0][0])
             y += 13
         y += 9
-
-
-def error_range(error: Floats) -> float:
-    """Half width of an axis on which these radius errors fit [m]; NaN does not count."""
-    largest = float(np.nanmax(np.abs(error), initial=0.0))
-    return first_at_least(1.1 * largest / MM, RANGES) * MM
-
-
-def _draw_chart(canvas: Canvas, box: Box, record: Record) -> None:
-    """The radius errors by the camera and the true ones, against time; a dot marks the newest true one."""
-    for left, text, colour in (
-        (38, "radius error [mm]", palette.FAINT), (136, "by the camera", palette.CAMERA), (220, "true", palette.TRUE),
-    ):  # fmt: skip
-        canvas.text(box.x + left, box.y + 4, text, colour)
-    # The camera's outliers must not set the scale.
-    plot, horizon, limit = box.inner(*MARGINS), record.config.horizon, error_range(record.error)
-    middle, per_metre = plot.y + 0.5 * plot.h, 0.5 * plot.h / limit
-    band = min(TOLERANCE, limit) * per_metre
-    canvas.rectangle(palette.BAND, Box(plot.x, middle - band, plot.w, 2.0 * band))
-    _draw_time_axis(canvas, plot, horizon)
-    for y, text in ((plot.y, f"{limit / MM:+g}"), (middle, "0"), (plot.bottom, f"{-limit / MM:+g}")):
-        canvas.lines(palette.RIM, [plot.x, plot.right], y, 0.6)
-        canvas.text(plot.x - 4, y - 6, text, palette.FAINT, 9.0, 1.0)
-    with canvas.clip(plot):
-        x, camera = plot.x + record.t / horizon * plot.w, middle - record.camera_error * per_metre
-        for piece in np.split(np.arange(len(x)), np.flatnonzero(np.isnan(camera))):
-            piece = piece[np.isfinite(camera[piece])]
-            canvas.lines(palette.NOISE, x[piece], camera[piece], 0.8)
-        true = middle - record.error * per_metre
-        canvas.lines(palette.TRUE, x, true, 1.7)
-    if np.isfinite(true[-1]):
-        canvas.dot(palette.TRUE, x[-1], min(max(true[-1], plot.y), plot.bottom), 2.6)
-
-
-def _draw_time_axis(canvas: Canvas, plot: Box, horizon: float) -> None:
-    y, step = plot.bottom + 2, first_at_least(horizon / MINUTE / 9.0, TICKS) * MINUTE
-    for number in range(int(horizon / step + 1e-9) + 1):
-        x = plot.x + number * step / horizon * plot.w
-        canvas.lines(palette.RIM, x, [plot.y, plot.bottom], 0.6)
-        if x < plot.right - 46:
-            hours, minutes = divmod(round(number * step / MINUTE), 60)
-            # The first one, centred, would touch the lowest number of the other axis.
-            canvas.text(x, y, f"{hours}:{minutes:02d}", palette.FAINT, 9.0, 0.5 if number else 0.0)
-    canvas.text(plot.right, y, f"{horizon / HOUR:.3g} h", palette.FAINT, 9.0, 1.0)
-
-
-def _draw_ending(canvas: Canvas, box: Box, ending: Ending) -> None:
-    """A band across a panel that says how the episode ended."""
-    band = Box(box.x, box.y + 6, box.w, 20)
-    fine = ending in (Ending.HORIZON, Ending.DONE)
-    canvas.rectangle(palette.RIM if fine else palette.ALARM, band)
-    canvas.text(box.x + box.w / 2.0, band.y + 3.5, ending.value, size=11, anchor=0.5, bold=True)

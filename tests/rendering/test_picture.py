@@ -10,13 +10,11 @@ from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.rendering import canvas
 from cz_gym.rendering import picture as triple_point
-from cz_gym.rendering.canvas import Canvas
-from cz_gym.rendering.picture import MARGINS, Ending, error_range, layout
+from cz_gym.rendering.picture import Ending, Picture
 from cz_gym.support.units import MM
 
 pygame = pytest.importorskip("pygame")
-CANVAS = Canvas(640, 480)
-PANELS = layout(CANVAS.box)
+BOX = Picture(640, 480).box
 
 
 def grown(steps=240, pull=0.0, kind=CzEnv, **arguments):
@@ -52,8 +50,8 @@ def test_a_whole_crystals_scale_follows_its_crown():
     widths = []
     for steps in (100, 900):
         frame, record = grown(steps, kind=CzCrystalEnv, action="direct", scenario="nominal")
-        scale = triple_point.scale_of(PANELS.triple_point, record)
-        assert scale.x(0.0) == PANELS.triple_point.x
+        scale = triple_point.scale_of(BOX, record)
+        assert scale.x(0.0) == BOX.x
         assert near(frame[round(scale.y_0) - 1], canvas.MELT).any()
         row, (r_c, _, z) = round(scale.y(record.last("h_c") + 5 * MM)), record.surface()
         edge = np.interp((scale.y_0 - (row + 0.5)) / scale.per_metre, z, r_c)
@@ -79,10 +77,10 @@ def test_how_a_whole_crystal_ends(moved, by, ending):
 
 def test_the_drawn_surface_is_the_logged_radius(picture):
     frame, record = picture
-    scale = triple_point.scale_of(PANELS.triple_point, record)
+    scale = triple_point.scale_of(BOX, record)
     r_c, _, z = record.surface()
     blue = near(frame, canvas.TRUE)
-    rows = range(round(PANELS.triple_point.y) + 8, round(scale.y(z[0])) - 8)
+    rows = range(round(BOX.y) + 8, round(scale.y(z[0])) - 8)
     for row in rows:
         check_near(blue[row], scale.x(np.interp((scale.y_0 - (row + 0.5)) / scale.per_metre, z, r_c)), 12)
     assert len(rows) > 50
@@ -92,17 +90,9 @@ def test_the_drawn_surface_is_the_logged_radius(picture):
 @pytest.mark.parametrize(("pull", "r_0"), [(-0.3, 87.5e-3), (0.3, 87.5e-3), (0.0, 20e-3), (0.0, 150e-3)])
 def test_the_rings_mark_is_at_the_rings_radius(pull, r_0):
     frame, record = grown(60, pull=pull, parameters=Parameters(r_0=r_0))
-    scale = triple_point.scale_of(PANELS.triple_point, record)
+    scale = triple_point.scale_of(BOX, record)
     # In the melt, where the mark's line goes down from the ring.
     check_near(near(frame, canvas.CAMERA)[round(scale.y_0 + 34)], scale.x(record.last("r_br")), 8)
-
-
-def test_the_chart_ends_at_the_true_error(picture):
-    frame, record = picture
-    plot = PANELS.chart.inner(*MARGINS)
-    x = round(plot.x + record.t[-1] / record.config.horizon * plot.w)
-    y = plot.y + plot.h / 2 - record.error[-1] / error_range(record.error) * plot.h / 2
-    check_near(near(frame, canvas.TRUE)[:, x : x + 3].any(axis=1), y, 8)
 
 
 @pytest.mark.parametrize(("model", "tolerance"), [(HURLE, 1e-6), (YOUNG_LAPLACE, 0.3 * MM)], ids=["hurle", "exact"])
@@ -130,5 +120,4 @@ def test_the_picture_of_a_failed_crystal_has_a_band_that_says_so(pull, ending):
     # Model I finds a balance without any pull; Model II grows on, and freezes.
     frame, record = grown(900, pull=pull, scenario="nominal", model="II")
     assert record.ending is ending
-    box = PANELS.triple_point
-    assert near(frame, canvas.ALARM, 5.0)[round(box.y) : round(box.y) + 30].sum() > 0.3 * 20 * box.w
+    assert near(frame, canvas.ALARM, 5.0)[round(BOX.y) : round(BOX.y) + 30].sum() > 0.3 * 20 * BOX.w
