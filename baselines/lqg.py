@@ -136,7 +136,7 @@ class LQGDesign:
     is lost (nested saturation, Teel 1992)."""
 
 
-PUZZLING = 1.0
+MISMATCH = 1.0
 """Mean of the ring's innovations over ten minutes, in standard deviations, that no good model has; of the pyrometer's,
 which may also stick or drift, twice as much [-]."""
 
@@ -227,10 +227,10 @@ class LQG(MeasuredController):
         inputs = self.law(state.mean, plan, previous)
         return inputs[:, 0], inputs[:, 1], Memory(state, plan, inputs, np.ones(len(inputs)))
 
-    def puzzled(self, memory: Memory) -> Any:
+    def model_mismatch(self, memory: Memory) -> Any:
         """Whether its model does not explain the readings: the innovations have a mean that noise has not."""
         warmth, width = np.abs(memory.filter.surprise).T
-        return np.maximum(0.5 * warmth, width) > PUZZLING
+        return np.maximum(0.5 * warmth, width) > MISMATCH
 
     def law(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
         """The regulator's inputs [m/s, W], deviations within the drives' range, shape (n, 2).

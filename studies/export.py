@@ -61,7 +61,7 @@ def rounded(runner: Runner) -> Any:
     return SimpleNamespace(start=runner.start, run=run)
 
 
-def beside(block: Block, others: Sequence[Runner]) -> tuple[Any, Any]:
+def with_same_readings(block: Block, others: Sequence[Runner]) -> tuple[Any, Any]:
     """A block that gives others the same readings; and the largest differences of their actions, which it keeps."""
     runners, worst = (block, *others), np.zeros(len(others))
 
@@ -85,7 +85,7 @@ def study(controller: str, scenario: str, crystals: int) -> list[Row]:
         rmse, step = float(np.mean(figures.rmse_mm)), float(np.mean(figures.pull_step_rms_mm_per_min))
         return round(rmse, 3), round(step, 4), int(run.failed.sum())
 
-    watched, worst = beside(block, compiled)
+    watched, worst = with_same_readings(block, compiled)
     python, rows = grown(watched), list[Row]()
     for real, runner, difference in zip(LARGEST, compiled, worst.tolist(), strict=True):
         c = grown(runner)

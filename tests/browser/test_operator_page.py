@@ -3,7 +3,7 @@
 import pytest
 
 from tests.browser.chromium import chromium, pytestmark, resize, until  # noqa: F401
-from tests.machine.serve.conftest import PASSWORD, running
+from tests.tools.serve.conftest import PASSWORD, running
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from cz_gym.support.units import KILO, MM, MM_PER_MIN
 from cz_gym.tools.export.controllers import make_block
 from cz_gym.tools.export.shell import BlockPolicy
 from examples import opcua_controller
-from tests.machine.serve.conftest import PASSWORD, running
+from tests.tools.serve.conftest import PASSWORD, running
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="cc is not installed: no C can be compiled")
 

@@ -167,17 +167,17 @@ def in_shares(setpoints: Mapping[str, Any], config: Config) -> Floats:
 
 # A sample of a block: what the time of a call means, which readings are good, what the drives do.
 
-JUMP, MEND = 8.0, 0.02 / MINUTE
+PYROMETER_JUMP, JUMP_GROWTH = 8.0, 0.02 / MINUTE
 """Largest difference of the pyrometer from what is expected [K], and its growth without a good reading [K/s]."""
-STUCK, SAME = 2.0 * MINUTE, 1e-4
-"""Time after which a pyrometer that changes by less than SAME [K] counts as stuck [s]."""
-FAR = 0.05
+FROZEN_TIME, FROZEN_CHANGE = 2.0 * MINUTE, 1e-4
+"""Time after which a pyrometer that changes by less than FROZEN_CHANGE [K] counts as stuck [s]."""
+FOLLOWING_ERROR = 0.05
 """Distance from its setpoint from which a drive does not follow, in shares of its range [-]."""
 _INPUTS = {port.name for port in INPUTS}
 
 
-class Facts(NamedTuple):
-    """The numbers of a block's puller that are no settings."""
+class PullerConstants(NamedTuple):
+    """Constants of the puller compiled into the block."""
 
     dt: float
     """Control interval [s]."""
@@ -196,59 +196,61 @@ class Facts(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """The memory of the shell, of its controller and of its PID."""
+    """The memory of the shell, of its controller and of its PID: numbers of shape (n,) each."""
 
     clock_s: Any
-    """Time up to which samples were taken [s], infinite before the first."""
+    """Time up to which samples were taken [s]; infinite before the first."""
     called_s: Any
-    """Time of the last call that took one [s]."""
+    """Time of the last call that took a sample [s]."""
     late: Any
     """1 if that call was late."""
     samples: Any
     """Number of samples of that call."""
     engaged: Any
     """1 if the last sample was automatic."""
-    since: Any
+    since_takeover: Any
     """Time since the takeover [s]."""
-    bad: Any
+    bad_readings_time: Any
     """Time without a good set of readings [s]."""
     fallback: Any
     """1 if the PID controls."""
     pull: Any
-    """Last setpoint of the pull speed [mm/min], infinite before the first."""
+    """Last setpoint of the pull speed [mm/min]; infinite before the first."""
     heater: Any
-    """Last setpoint of the heater power [kW]."""
-    astray: Any
+    """Last setpoint of the heater power [kW]; infinite before the first."""
+    drive_error_time: Any
     """Time for which a drive has not followed [s]."""
-    shown: Any
-    """Last reading of the pyrometer, good or not [K]."""
-    still: Any
-    """Time for which it has not changed [s]."""
-    dark: Any
+    last_T_1: Any
+    """Last reading of the pyrometer, good or not, above nominal [K]."""
+    frozen_time: Any
+    """Time for which the pyrometer's reading has not changed [s]."""
+    no_pyrometer_time: Any
     """Time without a good reading of the pyrometer [s]."""
-    level: Any
+    pull_bias: Any
     """Mean pull speed above nominal, relative [-]."""
-    calm: Any
+    settled_time: Any
     """Time since the takeover and since the pyrometer was last bad [s]."""
-    off_T_1: Any
-    """Error of the nominal temperature [K], as the takeover found it."""
-    off_Q_H: Any
-    """Error of the nominal power [W]."""
+    T_1_offset: Any
+    """Error of the nominal temperature, as the takeover found it [K]."""
+    Q_H_offset: Any
+    """Error of the nominal power, as the takeover found it [W]."""
     readings: Measured
-    """Last good readings, deviations, SI."""
+    """Last good readings, as deviations in SI units."""
     controller: Any
+    """The controller's own memory."""
     pid: Any
+    """The fallback's own memory."""
 
 
 class Call(NamedTuple):
-    """What a call's time means."""
+    """The samples that a call takes, from its time; shape (n,) each."""
 
     due: Any
     """Whether a sample is taken in this pass."""
     again: Any
-    """Whether another one follows in this call."""
+    """Whether another sample follows in this call."""
     later: Any
-    """Whether one went before in this call."""
+    """Whether a sample went before in this call."""
     share: Any
     """1 over the number of samples that are left with this one."""
     samples: Any
@@ -256,6 +258,7 @@ class Call(NamedTuple):
     starts: Any
     """Whether this is the first call, or the first after a gap."""
     late: Any
+    """Whether the call came late."""
     sound: Any
     """Whether the time moves forward."""
     clock: Any
@@ -263,7 +266,7 @@ class Call(NamedTuple):
 
 
 def call_of(dt: float, given: Any, memory: Memory) -> Call:
-    """What the time of a call means for a control interval of dt [s]."""
+    """The samples of a call at a control interval ``dt`` [s]: at most :data:`.trace.PASSES`; one after a gap."""
     time, begun = given["time_s"], finite(memory.clock_s)
     later = begun & (time == memory.called_s)
     behind = np.where(begun, time - memory.clock_s, dt)
@@ -280,37 +283,40 @@ def call_of(dt: float, given: Any, memory: Memory) -> Call:
 
 
 class Readings(NamedTuple):
-    """The readings of a sample and what is known of them."""
+    """The checked readings of a sample; shape (n,) each."""
 
     read: Measured
-    """With the last good one in place of each bad one, ring and drives on their way from the call before; from the
-    nominal values as set."""
+    """Deviations from the nominal settings. The last good reading stands for each bad one; ring and drives are on their
+    way from the call before."""
     T_1: Any
-    """The pyrometer's, infinite if it is bad [K]."""
+    """The pyrometer's reading above nominal; infinite if it is bad [K]."""
     plausible: Measured
+    """Whether each reading lies within the range of the observations."""
     ring: Any
     """Whether the ring is good."""
     pyrometer: Any
     """Whether the pyrometer is good."""
     reference: Any
     """Whether references and previews are good."""
-    shown: Any
-    still: Any
+    last_T_1: Any
+    """:attr:`Memory.last_T_1`."""
+    frozen_time: Any
+    """:attr:`Memory.frozen_time` [s]."""
 
 
-def sample_of(facts: Facts, call: Call, manual: Any, given: Any, memory: Memory) -> Readings:
-    """The readings of a call; ``manual``: whether the operator answers for them."""
-    seen, plausible = readings_of(given, facts.ranges)
+def sample_of(constants: PullerConstants, call: Call, manual: Any, given: Any, memory: Memory) -> Readings:
+    """Check and complete the readings of a sample; in ``manual`` no jump of the pyrometer is questioned."""
+    seen, plausible = readings_of(given, constants.ranges)
     age = given["time_s"] - given["ring_time_s"]
     ring = plausible.ring_error & (seen.valid > 0.5) & (np.abs(age) <= given["oldest_reading_s"])
     reference = reduce(and_, (getattr(plausible, name) for name in Measured._fields if "ref" in name))
     first = Measured(*(np.where(good, value, 0.0) for good, value in zip(plausible, seen, strict=True)))
     last = Measured(*(np.where(call.starts, new, old) for old, new in zip(memory.readings, first, strict=True)))
-    same = ~call.starts & (np.abs(seen.T_1 - memory.shown) <= SAME)
-    still = np.where(same, memory.still + np.where(call.later, 0.0, facts.dt), 0.0)
+    same = ~call.starts & (np.abs(seen.T_1 - memory.last_T_1) <= FROZEN_CHANGE)
+    frozen_time = np.where(same, memory.frozen_time + np.where(call.later, 0.0, constants.dt), 0.0)
     expected = last.T_1 + np.where(reference, seen.T_1_ref - last.T_1_ref, 0.0)
-    near = np.abs(seen.T_1 - expected) <= facts.jump + MEND * memory.dark
-    pyrometer = plausible.T_1 & (still <= STUCK) & (near | manual | call.starts)
+    near = np.abs(seen.T_1 - expected) <= constants.jump + JUMP_GROWTH * memory.no_pyrometer_time
+    pyrometer = plausible.T_1 & (frozen_time <= FROZEN_TIME) & (near | manual | call.starts)
     good = plausible._replace(T_1=pyrometer)
     trusted = Measured(*(np.where(each, value, np.inf) for each, value in zip(good, seen, strict=True)))
     read = readable(trusted._replace(valid=np.where(ring, 1.0, 0.0)), last)
@@ -318,19 +324,13 @@ def sample_of(facts: Facts, call: Call, manual: Any, given: Any, memory: Memory)
     moving = {name: (getattr(last, name), getattr(read, name)) for name in ("ring_error", "v_p", "Q_H")}
     share = np.where(manual, 1.0, call.share)
     read = read._replace(**{name: old + share * (new - old) for name, (old, new) in moving.items()})
-    mean = np.where(call.starts, read.v_p, moved_mean(last.v_p_mean, read.v_p, facts.dt))
+    mean = np.where(call.starts, read.v_p, moved_mean(last.v_p_mean, read.v_p, constants.dt))
     read = read._replace(v_p_mean=mean)
-    shown = np.where(finite(seen.T_1), seen.T_1, np.inf)
-    return Readings(read, trusted.T_1, plausible, ring, pyrometer, reference, shown, still)
+    last_T_1 = np.where(finite(seen.T_1), seen.T_1, np.inf)
+    return Readings(read, trusted.T_1, plausible, ring, pyrometer, reference, last_T_1, frozen_time)
 
 
-def trimmed(read: Measured, off_T_1: Any, off_Q_H: Any) -> Measured:
-    """The readings from the nominal values less their errors."""
-    temperatures = {name: getattr(read, name) - off_T_1 for name in Measured._fields if name.startswith("T_1")}
-    return read._replace(**temperatures, Q_H=read.Q_H - off_Q_H)
-
-
-def sane_of(given: Any) -> Any:
+def settings_are_sane(given: Any) -> Any:
     """Whether the settings are numbers in the right order."""
     ordered = given["pull_speed_min_mm_per_min"] <= given["pull_speed_max_mm_per_min"]
     ordered = ordered & (given["heater_power_min_kW"] <= given["heater_power_max_kW"])
@@ -349,8 +349,9 @@ class Drive(NamedTuple):
     held: Any
     """The last setpoint; before the first one the nominal value."""
     nominal: Any
+    """The drive at the operating point, as set."""
     far: Any
-    """Distance from which it does not follow."""
+    """Distance from its setpoint from which the drive does not follow."""
     slew: Any
     """Largest change in a minute."""
     span: tuple[Any, Any]
@@ -358,17 +359,17 @@ class Drive(NamedTuple):
 
     @property
     def away(self) -> Any:
-        """Whether it is far from its last setpoint."""
+        """Whether the drive is far from its last setpoint."""
         return self.known & (np.abs(self.applied - self.held) > self.far)
 
     def near(self, setpoint: Any, lost: Any) -> Any:
-        """The setpoint; where the drive does not follow, no farther from it than needed to see that it does again."""
+        """Keep the setpoint of a drive that does not follow so near that one sees when the drive follows again."""
         return np.where(lost, np.clip(setpoint, self.applied - 2.0 * self.far, self.applied + 2.0 * self.far), setpoint)
 
-    def move(self, old: Any, wanted: Any, share: Any, dt: float) -> tuple[Any, Any]:
-        """The setpoint on its way from ``old`` to a value, and whether range or slew rate cut it."""
+    def move(self, old: Any, wanted: Any, authority: Any, dt: float) -> tuple[Any, Any]:
+        """The setpoint after one interval on its way from ``old`` to a value, and whether range or slew rate cut it."""
         ends = wanted, np.clip(wanted, *self.span)
-        free, bound = (np.where(share < 1.0, old + share * (to - old), to) for to in ends)
+        free, bound = (np.where(authority < 1.0, old + authority * (to - old), to) for to in ends)
         most = self.slew * (dt / MINUTE)
         limit = np.clip(bound, old - most, old + most)
         return limit, np.abs(limit - free) > 1e-6
@@ -381,14 +382,16 @@ _PORTS = (
 """Names of each drive's reading, of the ends of its range, its nominal value and its slew rate."""
 
 
-def drive_of(sane: Any, facts: Facts, call: Call, seen: Readings, given: Any, memory: Memory, which: int) -> Drive:
-    """The pull (0) or the heater (1) at a sample."""
+def drive_of(
+    sane: Any, constants: PullerConstants, call: Call, seen: Readings, given: Any, memory: Memory, which: int
+) -> Drive:
+    """The pull (``which`` = 0) or the heater (1) at a sample."""
     reading, end, at_rest, slew = _PORTS[which]
     known = np.where(sane, (seen.plausible.v_p, seen.plausible.Q_H)[which], finite(given[reading]))
     nominal, last = given[at_rest], (memory.pull, memory.heater)[which]
-    held = np.where(finite(last), last, np.where(finite(nominal), nominal, facts.nominal[which]))
+    held = np.where(finite(last), last, np.where(finite(nominal), nominal, constants.nominal[which]))
     span = given[end.format("min")], given[end.format("max")]
-    applied, far = np.where(known, given[reading], held), FAR * (span[1] - span[0])
+    applied, far = np.where(known, given[reading], held), FOLLOWING_ERROR * (span[1] - span[0])
     return Drive(known, applied, held, nominal, far, given[slew], span)
 
 

@@ -1,6 +1,9 @@
-"""A trained agent as a controller of the shell: its ONNX graph in NumPy, its observation, what its actions mean."""
+"""Controllers and agents by name, each in its shell: for exports, and for the virtual puller.
 
-import pkgutil
+A classical controller is NumPy code already. A trained agent becomes a controller of the shell by :class:`Agent`: its
+ONNX graph in NumPy, its observation, and the drives that its actions mean.
+"""
+
 import re
 import unicodedata
 from collections.abc import Callable
@@ -10,6 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym import agents
+from cz_gym.baselines.fallback import fallback
 from cz_gym.body.process import BODY
 from cz_gym.body.signals import Measured
 from cz_gym.config import Config
@@ -19,6 +24,7 @@ from cz_gym.puller.file import DEFAULT
 from cz_gym.spaces import CLIP, HEATER_SLACK, HISTORY, INTEGRAL_SCALE, LAGGED, MEASURED, drives_of, lags
 from cz_gym.support.errors import CzError
 from cz_gym.support.names import unknown_name_message
+from cz_gym.tools.registry import CONTROLLERS
 
 from .shell import Block
 
@@ -38,50 +44,27 @@ def _split(x: Any, lengths: Any = None, axis: int = 0, parts: int = 1) -> Any:
     return np.split(x, parts if lengths is None else np.cumsum(lengths)[:-1].tolist(), axis)
 
 
-def _layer_norm(x: Any, scale: Any, bias: Any = 0.0, epsilon: float = 1e-5, **_: Any) -> Any:
-    mean = np.full((x.shape[-1], 1), 1.0 / x.shape[-1])
-    apart = x - x @ mean
-    return apart / np.sqrt(apart * apart @ mean + epsilon) * scale + bias
-
-
-def _erf(x: Any) -> Any:
-    """The error function to 1.5e-7: formula 7.1.26 of Abramowitz and Stegun."""
-    t = 1.0 / (1.0 + 0.3275911 * np.absolute(x))
-    series = ((((1.061405429 * t - 1.453152027) * t + 1.421413741) * t - 0.284496736) * t + 0.254829592) * t
-    return np.where(x > 0.0, 1.0, -1.0) * (1.0 - series * np.exp(-x * x))
-
-
-def _elu(x: Any, alpha: float = 1.0) -> Any:
-    return np.where(x > 0.0, x, alpha * (np.exp(np.minimum(x, 0.0)) - 1.0))
-
-
-def _leaky(x: Any, alpha: Any = 0.01) -> Any:
-    return np.where(x > 0.0, x, alpha * x)
-
-
 OPERATORS: dict[str, Callable[..., Any]] = {
-    "Add": np.add, "Sub": np.subtract, "Mul": np.multiply, "Div": np.divide, "Neg": np.negative, "Sqrt": np.sqrt,
-    "Tanh": np.tanh, "MatMul": np.matmul, "Gemm": _gemm, "Slice": _slice, "Split": _split,
-    "Clip": lambda x, low=None, high=None: np.clip(x, low, high),
-    "Identity": lambda x: x, "Concat": lambda *x, axis: np.concatenate(x, axis=axis),
-    "Gather": lambda x, at, axis=0: np.moveaxis(np.moveaxis(x, axis, 0)[at], 0, axis),
+    "Add": np.add, "Sub": np.subtract, "Mul": np.multiply, "Div": np.divide, "MatMul": np.matmul, "Gemm": _gemm,
+    "Slice": _slice, "Split": _split, "Concat": lambda *x, axis: np.concatenate(x, axis=axis), "Identity": lambda x: x,
+    "Clip": lambda x, low=None, high=None: np.clip(x, low, high), "Tanh": np.tanh,
     "Relu": lambda x: np.maximum(x, 0.0), "Sigmoid": lambda x: 0.5 + 0.5 * np.tanh(0.5 * x),
-    "Softplus": lambda x: np.maximum(x, 0.0) + np.log(1.0 + np.exp(-np.absolute(x))),
-    "LeakyRelu": _leaky, "PRelu": _leaky, "Elu": _elu, "Celu": lambda x, alpha=1.0: alpha * _elu(x / alpha),
-    "Selu": lambda x, alpha=1.6732632, gamma=1.050701: gamma * _elu(x, alpha),
-    "HardSigmoid": lambda x, alpha=0.2, beta=0.5: np.clip(alpha * x + beta, 0.0, 1.0),
-    "HardSwish": lambda x: x * np.clip(x / 6.0 + 0.5, 0.0, 1.0),
-    "Abs": np.absolute, "Erf": _erf, "LayerNormalization": _layer_norm,
 }  # fmt: skip
-"""The operators that an agent's graph may hold, :data:`cz_gym.agents.graph.OPERATORS`, in NumPy."""
+"""ONNX operators of MLPs, GRUs and LSTMs with tanh, relu and sigmoid, in NumPy."""
 
 
 def network_of(content: bytes) -> Callable[..., list[Any]]:
-    """An agent's checked ONNX graph as a function of NumPy arrays of shape (n, width), in double precision."""
+    """An agent's checked ONNX graph as a function of NumPy arrays of shape (n, width), in double precision.
+
+    CzError for an operator beyond :data:`OPERATORS`.
+    """
     import onnx
     from onnx import helper, numpy_helper
 
     graph = onnx.load_from_string(content).graph
+    if others := sorted({node.op_type for node in graph.node} - OPERATORS.keys()):
+        allowed = "MLP, GRU or LSTM with tanh, relu or sigmoid"
+        raise CzError(f"an agent with the operator {others[0]} cannot be exported: its network must be an {allowed}")
     tensors = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
     weights = {name: each.astype(np.float64) if each.dtype == np.float32 else each for name, each in tensors.items()}
 
@@ -98,7 +81,7 @@ def network_of(content: bytes) -> Callable[..., list[Any]]:
 
 
 class AgentMemory(NamedTuple):
-    """The memory of an agent outside Python. Sums and integral are that of the observation "history"."""
+    """The memory of an agent outside Python; the first two belong to the observation "history"."""
 
     sums: Any
     """Running sums of the remembered channels less the newest ones, the newest first, shape (n, depth, channels)."""
@@ -107,7 +90,7 @@ class AgentMemory(NamedTuple):
     command: Any
     """Last commanded inputs in shares of their ranges, shape (n, 2)."""
     network: Any
-    """The network's own state, shape (n, k)."""
+    """The network's recurrent state, shape (n, k)."""
 
 
 class Agent:
@@ -184,42 +167,35 @@ def _uncompiled(function: Any, like: Any) -> Any:
     return FunctionType(function.__code__, function.__globals__ | own)
 
 
-# A controller or an agent by its name in the shell that a plant needs: for exports, and for the virtual puller.
-
-REGISTRY, AGENTS, SEARCH = "cz_gym.tools.registry", "cz_gym.agents", "cz_gym.baselines.fallback:fallback"
-"""Modules that know controllers and agents, and the search for the PID that takes over, looked up by name because this
-package imports neither."""
 FALLBACK = "fallback"
 """Name of the PID that takes over, as a controller of its own."""
 
 
 def make_block(name: str, config: Config) -> Block:
-    """A controller or agent in its shell; its fallback is a PID searched for the puller.
+    """Put a controller or agent into its shell, whose fallback is a PID searched for the puller.
 
     CzError if there is none of that name, if it cannot be exported, or if an agent is of another puller.
     """
-    agents: Any = pkgutil.resolve_name(AGENTS)
-    known = [entry.name for entry in pkgutil.resolve_name(f"{REGISTRY}:CONTROLLERS") if not entry.bound]
+    known = {entry.name: entry for entry in CONTROLLERS if not entry.bound}
     plant = f"Puller {config.puller.label}; plant {config.plant_hash}; control interval {config.control_interval:g} s."
     if name not in (*known, FALLBACK, *agents.shipped_names()) and Path(name).suffix != ".onnx":
         raise CzError(unknown_name_message("controller or agent", name, [*known, FALLBACK, *agents.shipped_names()]))
-    pid, *margins = pkgutil.resolve_name(SEARCH)(config)
-    fallback = (
+    pid, *margins = fallback(config)
+    takes_over = (
         f"Fallback: PID searched for this puller with the drives and the camera of scenario {config.scenario.name}: "
         "gain margin {:.3g}, phase margin {:.3g} deg on Models I and II with a latency of {:g} s.".format(*margins)
     )
     identifier = identifier_of(Path(name.removesuffix(".onnx")).name)
     if name == FALLBACK:
-        return Block(identifier, pid, pid, config, (fallback, plant))
+        return Block(identifier, pid, pid, config, (takes_over, plant))
     if name in known:
-        entry = pkgutil.resolve_name(f"{REGISTRY}:find_controller")(name)
         tuned = f"Settings of scenario {config.scenario.name} ({config.scenario.hash})"
         if config.puller != DEFAULT:
             tuned = "Settings scaled to the puller, or searched for it beside its file"
-        controller = entry.make(config)
+        controller = known[name].make(config)
         if not getattr(controller, "exportable", False):
             raise CzError(f"{name} cannot be exported: it has no feedback, several filters or an optimisation")
-        facts = f"Controller {name}: {entry.meaning}.", f"{tuned}.", plant, fallback
+        facts = f"Controller {name}: {known[name].meaning}.", f"{tuned}.", plant, takes_over
         return Block(identifier, controller, pid, config, facts)
     contract = (policy := agents.load(name)).contract
     its, own = (
@@ -231,7 +207,7 @@ def make_block(name: str, config: Config) -> Block:
     trained = f"trained on {contract.scenario} ({contract.scenario_hash})"
     about = f"Agent {name}: {contract.algorithm}, seed {contract.training_seed}, {trained}."
     file = f"File {contract.sha256}; observation {contract.observation} {contract.observation_hash}."
-    return Block(identifier, Agent(policy, config), pid, config, (about, file, plant, fallback))
+    return Block(identifier, Agent(policy, config), pid, config, (about, file, plant, takes_over))
 
 
 def identifier_of(name: str) -> str:

@@ -1,4 +1,4 @@
-"""What a plant needs around a controller: takeover, limits, hold, fallback, alarms.
+"""The shell around a controller: takeover, limits, hold, fallback, alarms.
 
 The controller runs on a grid of its own interval. A call makes as many samples as intervals have passed, up to
 :data:`PASSES` of them; after a gap it is a takeover. Readings that are not finite, invalid, too old, outside the range
@@ -30,11 +30,11 @@ from cz_gym.support.units import KILO, MINUTE, MM_PER_MIN
 
 from .block import (
     INPUTS,
-    JUMP,
     OUTPUTS,
+    PYROMETER_JUMP,
     Alarm,
-    Facts,
     Memory,
+    PullerConstants,
     call_of,
     drive_of,
     finite,
@@ -42,35 +42,37 @@ from .block import (
     in_shares,
     nominal_puller,
     sample_of,
-    sane_of,
+    settings_are_sane,
     settings_of,
-    trimmed,
 )
 from .trace import PASSES, Floats, Port, Program, record
 
-BLIND = MINUTE
+NO_PYROMETER_TIME = MINUTE
 """Time for which a controller that estimates the temperature keeps the heater without a pyrometer [s]."""
-ASTRAY = MINUTE
+DRIVE_ERROR_TIME = MINUTE
 """Time after which a drive counts as not following [s]."""
-LEVEL, TRIM_T_1, TRIM_Q_H = 5.0 * MINUTE, 0.5, 0.005
+PULL_BIAS_TIME, TRIM_T_1, TRIM_Q_H = 5.0 * MINUTE, 0.5, 0.005
 """Averaging time of the pull speed [s]; what a takeover leaves of the deviation from the nominal temperature [K] and
 power [share of the heater's range]. The rest counts as an error of the nominal values."""
-SETTLED = 30.0 * MINUTE
+SETTLED_TIME = 30.0 * MINUTE
 """Time since a takeover or a bad pyrometer, from which it counts that a model does not explain the readings [s]."""
 SLOWER, FOLLOWED = 1.5, 0.5
-"""How the heater moves without a pyrometer: the time constant of the mean pull speed, in multiples of its averaging
-time, and the share of the recipe's movement that is followed [-]."""
+"""Heater without a pyrometer: time constant of the mean pull speed, in multiples of its averaging time, and share of
+the recipe's movement that is followed [-]."""
 TEMPERATURES = "T_1", "T_2", "T_b"
-UNKNOWN = "clock_s", "called_s", "pull", "heater", "shown"
-"""Memory that is infinite before the first sample."""
+UNKNOWN = "clock_s", "called_s", "pull", "heater", "last_T_1"
+"""Fields of :class:`.block.Memory` that are infinite before the first sample."""
 
 
 class Controller(Protocol):
-    """What the shell is put around, :class:`cz_gym.baselines.policy.MeasuredController` for one."""
+    """A controller that can stand in the shell, such as :class:`cz_gym.baselines.policy.MeasuredController`.
+
+    One with a method ``model_mismatch(memory)`` also says where its model does not explain the readings.
+    """
 
     @property
     def accepts_missing_temperature(self) -> bool:
-        """Whether it is given a pyrometer reading that is not finite as such."""
+        """Whether the controller estimates the temperature, and so gets an infinite reading of a bad pyrometer."""
 
     def at_rest(self, seen: Measured) -> Any:
         """The controller's memory before the first sample."""
@@ -79,34 +81,43 @@ class Controller(Protocol):
         """Pull speed [m/s] and heater power [W] above nominal, and the new memory."""
 
 
-def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memory: Any) -> Any:
-    """Outputs, memory, whether a sample was due and whether another is, for settings and inputs by their names."""
-    dt, sane, call = facts.dt, sane_of(given), call_of(facts.dt, given, memory)
+def step(controller: Controller, pid: Controller, constants: PullerConstants, given: Any, memory: Any) -> Any:
+    """Take one sample: outputs, memory, whether a sample was due and whether another one is.
+
+    ``given`` holds settings and inputs by name. The order is: time and readings, drives, who controls, the controller
+    and the PID on the same readings, limits, alarms.
+    """
+    dt, sane, call = constants.dt, settings_are_sane(given), call_of(constants.dt, given, memory)
     automatic, before = (given["automatic"] > 0.5) & sane, (memory.engaged > 0.5) & ~call.starts
-    seen = sample_of(facts, call, ~(automatic & before), given, memory)
-    drives = [drive_of(sane, facts, call, seen, given, memory, which) for which in (0, 1)]
+    seen = sample_of(constants, call, ~(automatic & before), given, memory)
+    drives = [drive_of(sane, constants, call, seen, given, memory, which) for which in (0, 1)]
     known = drives[0].known & drives[1].known
     engaged = automatic & (before | known)
     runs = engaged & before
     away = runs & (drives[0].away | drives[1].away)
-    astray = np.where(call.later, memory.astray, np.where(away, memory.astray + dt, 0.0))
+    held_error = np.where(away, memory.drive_error_time + dt, 0.0)
+    drive_error_time = np.where(call.later, memory.drive_error_time, held_error)
     good = seen.ring & seen.reference & known
-    bad = np.where(good, 0.0, np.where(call.starts, 0.0, memory.bad) + dt)
-    dark = np.where(seen.pyrometer, 0.0, np.where(call.starts, 0.0, memory.dark) + dt)
-    calm = np.where(runs & seen.pyrometer, memory.calm + dt, 0.0)
-    puzzled = (calm > SETTLED) & (controller.puzzled(memory.controller) if hasattr(controller, "puzzled") else False)
+    bad_readings_time = np.where(good, 0.0, np.where(call.starts, 0.0, memory.bad_readings_time) + dt)
+    no_pyrometer_time = np.where(seen.pyrometer, 0.0, np.where(call.starts, 0.0, memory.no_pyrometer_time) + dt)
+    settled_time = np.where(runs & seen.pyrometer, memory.settled_time + dt, 0.0)
+    has_check = hasattr(controller, "model_mismatch")
+    mismatch = (settled_time > SETTLED_TIME) & (controller.model_mismatch(memory.controller) if has_check else False)
     fallen = runs & (memory.fallback > 0.5)
-    fallback = runs & (fallen | (bad > given["fallback_after_s"]) | puzzled)
-    since = np.where(runs & (fallen | ~fallback), memory.since + dt, 0.0)
-    share = np.minimum(since / np.maximum(given["takeover_s"], 1e-3), 1.0)
+    fallback = runs & (fallen | (bad_readings_time > given["fallback_after_s"]) | mismatch)
+    since_takeover = np.where(runs & (fallen | ~fallback), memory.since_takeover + dt, 0.0)
+    authority = np.minimum(since_takeover / np.maximum(given["takeover_s"], 1e-3), 1.0)
 
-    off_T_1 = np.where(runs, memory.off_T_1, np.where(seen.pyrometer, _beyond(seen.read.T_1, TRIM_T_1), 0.0))
-    off_Q_H = np.where(runs, memory.off_Q_H, _beyond(seen.read.Q_H, TRIM_Q_H * facts.ranges[1]))
-    read = trimmed(seen.read, off_T_1, off_Q_H)
-    nominal = drives[0].nominal, drives[1].nominal + off_Q_H / KILO
+    # Errors of the nominal values, as the takeover finds them, are taken off all later readings.
+    at_takeover = np.where(seen.pyrometer, _excess(seen.read.T_1, TRIM_T_1), 0.0)
+    T_1_offset = np.where(runs, memory.T_1_offset, at_takeover)
+    Q_H_offset = np.where(runs, memory.Q_H_offset, _excess(seen.read.Q_H, TRIM_Q_H * constants.ranges[1]))
+    temperatures = {n: getattr(seen.read, n) - T_1_offset for n in Measured._fields if n.startswith("T_1")}
+    read = seen.read._replace(**temperatures, Q_H=seen.read.Q_H - Q_H_offset)
+    nominal = drives[0].nominal, drives[1].nominal + Q_H_offset / KILO
     estimates = controller.accepts_missing_temperature
     # The samples of a call have one frame in common, whose noise counts once.
-    told = read._replace(T_1=np.where(call.again, np.inf, seen.T_1 - off_T_1), valid=read.valid / call.samples)
+    told = read._replace(T_1=np.where(call.again, np.inf, seen.T_1 - T_1_offset), valid=read.valid / call.samples)
     held = memory.controller if runs.all() else select(runs, memory.controller, controller.at_rest(read))
     own = controller.step(told if estimates else read, held)
     other = own[0], own[1], memory.pid
@@ -116,17 +127,18 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
         np.where(fallback, second, first) / unit + at
         for first, second, unit, at in zip(own[:2], other[:2], (MM_PER_MIN, KILO), nominal, strict=True)
     )
-    lost = astray > ASTRAY
+
+    lost = drive_error_time > DRIVE_ERROR_TIME
     old = [np.where(runs, each.near(each.held, lost), each.applied) for each in drives]
-    level = np.where(call.starts, 0.0, memory.level)
-    level = level + min(dt / LEVEL, 1.0) * (seen.read.v_p / (drives[0].nominal * MM_PER_MIN) - level)
-    blind = ~seen.pyrometer & ((dark > BLIND) | fallback | (not estimates))
+    bias = np.where(call.starts, 0.0, memory.pull_bias)
+    bias = bias + min(dt / PULL_BIAS_TIME, 1.0) * (seen.read.v_p / (drives[0].nominal * MM_PER_MIN) - bias)
+    blind = ~seen.pyrometer & ((no_pyrometer_time > NO_PYROMETER_TIME) | fallback | (not estimates))
     moved = np.where(seen.reference & ~call.starts, seen.read.T_1_ref - memory.readings.T_1_ref, 0.0)
-    trim = FOLLOWED * facts.feed * moved + facts.trim * (level - memory.level + dt / facts.slow * level)
+    trim = FOLLOWED * constants.feed * moved + constants.trim * (bias - memory.pull_bias + dt / constants.slow * bias)
     wanted = np.where(fallback & ~seen.ring, old[0], pull), np.where(blind, old[1] + trim / KILO, heater)
     sound = finite(wanted[0]) & finite(wanted[1])
     moves = [
-        each.move(start, np.where(sound, target, start), share, dt)
+        each.move(start, np.where(sound, target, start), authority, dt)
         for each, start, target in zip(drives, old, wanted, strict=True)
     ]
     setpoints = [
@@ -137,23 +149,24 @@ def step(controller: Controller, pid: Controller, facts: Facts, given: Any, memo
         Alarm.RING: ~seen.ring, Alarm.PYROMETER: ~seen.pyrometer, Alarm.DRIVES: ~known,
         Alarm.REFERENCE: ~seen.reference, Alarm.LATE: call.late, Alarm.CLOCK: ~call.sound,
         Alarm.PULL_LIMITED: engaged & moves[0][1], Alarm.HEATER_LIMITED: engaged & moves[1][1],
-        Alarm.TAKEOVER: engaged & (share < 1.0), Alarm.FALLBACK: fallback, Alarm.FAILED: engaged & ~sound,
-        Alarm.MANUAL: ~engaged, Alarm.SETTINGS: ~sane, Alarm.ASTRAY: lost, Alarm.MODEL: puzzled,
+        Alarm.TAKEOVER: engaged & (authority < 1.0), Alarm.FALLBACK: fallback, Alarm.FAILED: engaged & ~sound,
+        Alarm.MANUAL: ~engaged, Alarm.SETTINGS: ~sane, Alarm.ASTRAY: lost, Alarm.MODEL: mismatch,
     }  # fmt: skip
     alarms = reduce(add, (np.where(holds, float(bit), 0.0) for bit, holds in bits.items()))
     outputs = dict(zip((port.name for port in OUTPUTS), (*setpoints, alarms), strict=True))
     now = Memory(
         clock_s=call.clock, called_s=given["time_s"], late=np.where(call.late, 1.0, 0.0),
-        samples=call.samples, engaged=np.where(engaged, 1.0, 0.0), since=since, bad=bad,
-        fallback=np.where(fallback | (engaged & ~sound), 1.0, 0.0), pull=setpoints[0], heater=setpoints[1],
-        astray=astray, shown=seen.shown, still=seen.still, dark=dark, level=level, calm=calm, off_T_1=off_T_1,
-        off_Q_H=off_Q_H, readings=seen.read, controller=own[2], pid=other[2],
+        samples=call.samples, engaged=np.where(engaged, 1.0, 0.0), since_takeover=since_takeover,
+        bad_readings_time=bad_readings_time, fallback=np.where(fallback | (engaged & ~sound), 1.0, 0.0),
+        pull=setpoints[0], heater=setpoints[1], drive_error_time=drive_error_time, last_T_1=seen.last_T_1,
+        frozen_time=seen.frozen_time, no_pyrometer_time=no_pyrometer_time, pull_bias=bias, settled_time=settled_time,
+        T_1_offset=T_1_offset, Q_H_offset=Q_H_offset, readings=seen.read, controller=own[2], pid=other[2],
     )  # fmt: skip
     return outputs, now, call.due, call.again
 
 
-def _beyond(value: Any, most: float) -> Any:
-    """What a value has beyond +-most."""
+def _excess(value: Any, most: float) -> Any:
+    """Excess over the limits +-most; zero inside."""
     return value - np.clip(value, -most, most)
 
 
@@ -198,8 +211,8 @@ class Block:
         return outputs, memory
 
     @cached_property
-    def facts(self) -> Facts:
-        """What the shell knows of the puller."""
+    def constants(self) -> PullerConstants:
+        """Constants of the puller compiled into the block."""
         config, puller = self.config, nominal_puller(self.config)
         hot = linearise(puller, config.meniscus)
         at = [STATES.index(name) for name in TEMPERATURES]
@@ -208,15 +221,17 @@ class Block:
         pull = T_b * puller.k_l / (puller.v_0 * puller.rho_dH * puller.h_0)
         slow = -1.0 / float(np.linalg.eigvals(A).real.max())
         noise = max(each.sensor.pyrometer_noise[1] for each in config.scenario.scenarios)
-        trim, nominal = slow / (pull * SLOWER * LEVEL), (puller.v_0 / MM_PER_MIN, puller.Q_H_0 / KILO)
-        return Facts(config.control_interval, config.ranges, JUMP + 8.0 * noise, 1.0 / T_1, trim, slow, nominal)
+        trim, nominal = slow / (pull * SLOWER * PULL_BIAS_TIME), (puller.v_0 / MM_PER_MIN, puller.Q_H_0 / KILO)
+        return PullerConstants(
+            config.control_interval, config.ranges, PYROMETER_JUMP + 8.0 * noise, 1.0 / T_1, trim, slow, nominal
+        )
 
     def _step(self, given: Any, memory: Any) -> Any:
-        return step(self.controller, self.pid, self.facts, given, memory)
+        return step(self.controller, self.pid, self.constants, given, memory)
 
     @cached_property
     def program(self) -> Program:
-        """The record of what it computes."""
+        """The recorded operations of one sample."""
         return record(self._step, self.start(1), (settings_of(self.config), INPUTS, OUTPUTS), self.name, self.notes)
 
 
@@ -224,7 +239,7 @@ class Block:
 
 
 class Runner(Protocol):
-    """What runs n blocks: :class:`Block`, or its compiled form."""
+    """Runs n blocks at once: :class:`Block`, or its compiled form."""
 
     def start(self, n: int) -> Any:
         """The memory of n blocks before their first sample."""
@@ -234,7 +249,7 @@ class Runner(Protocol):
 
 
 class BlockState(NamedTuple):
-    """What a block's policy remembers."""
+    """The state of :class:`BlockPolicy` between calls."""
 
     samples: npt.NDArray[np.int64]
     """Number of samples since the episode began, shape (n,)."""
@@ -256,13 +271,13 @@ class BlockPolicy:
 
     block: Block
     runner: Runner | None = None
-    """What runs it in place of Python."""
+    """Runs the block in place of Python."""
     interval: float | None = None
-    """Control interval of the environment, if it is another one than the block's [s]."""
+    """Control interval of the environment, if it differs from the block's [s]."""
 
     @property
     def made_for(self) -> TargetEnv:
-        """The environment that takes its actions."""
+        """The environment for which the actions are meant."""
         made_for = self.block.config.made_for
         return made_for._replace(action=self.action, control_interval=self.interval or made_for.control_interval)
 

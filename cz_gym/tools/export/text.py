@@ -72,7 +72,7 @@ def _parts(program: Program, writer: StatementWriter) -> dict[str, str]:
         "name": [f"cz_{program.name}"],
         "NAME": [f"cz_{program.name}".upper()],
         "real": [own("type of real")],
-        "about": (line for note in notes for line in wrap(harmless(note), 100)),
+        "about": (line for note in notes for line in wrap(safe_in_comment(note), 100)),
         "bits": (own("bit", bit.name, bit.value, meaning) for bit, meaning in meanings(Alarm).items()),
         "inputs": declared("input", program.inputs, "reading"),
         "settings": declared("setting", program.settings, "reading"),
@@ -91,7 +91,7 @@ def _parts(program: Program, writer: StatementWriter) -> dict[str, str]:
     return {part: "\n".join(lines) for part, lines in parts.items()}
 
 
-def harmless(text: str) -> str:
+def safe_in_comment(text: str) -> str:
     """A text that may stand in a comment of any language: plain ASCII without ends or beginnings of comments."""
     plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
     return re.sub(r"[*\\?{}$]+", "", plain)
@@ -190,7 +190,7 @@ def test_vector(block: Block) -> str:
     return "\n".join(lines) + "\n"
 
 
-def beside(block: Block, log: Any) -> tuple[Floats, Floats]:
+def setpoints_on_log(block: Block, log: Any) -> tuple[Floats, Floats]:
     """Setpoints [mm/min, kW] that a block gives on a log, each from the drives of its row, and its alarms; per row."""
     memory, rows = block.start(1), []
     radius, T_1 = (block.ports[name].default for name in ("nominal_radius_mm", "nominal_T_1_K"))
@@ -212,7 +212,7 @@ def beside(block: Block, log: Any) -> tuple[Floats, Floats]:
 
 def shadow(block: Block, log: Any) -> dict[str, str]:
     """A table of the setpoints, as CSV, and a report that compares them with the drives of a log; by file name."""
-    setpoints, alarms = beside(block, log)
+    setpoints, alarms = setpoints_on_log(block, log)
     drives = np.stack([log.v_p / MM_PER_MIN, log.Q_H / KILO], axis=-1)
     held = np.vstack([drives[1:], drives[-1:]])  # a row's setpoint is what the next row shows as applied
     names, rows = [port.name for port in OUTPUTS[:2]], []

@@ -57,16 +57,16 @@ def commands() -> OneLineParser:
     return parser
 
 
-def door_of(arguments: argparse.Namespace) -> Any:
+def access_control(arguments: argparse.Namespace) -> Any:
     """The accounts that may log in; CzError for too short a password, and for another address without an operator."""
-    from .opcua import Account, Door, password
+    from .opcua import AccessControl, Account, password
 
     given = (("operator", arguments.operator, True), ("reader", arguments.reader, False))
     accounts = tuple(Account(name, password(role), writes) for role, name, writes in given if name)
     remote = not _is_loopback(arguments.host)
     if remote and not arguments.operator:
         raise CzError(f"to listen on {arguments.host}, --operator and its password are needed; 127.0.0.1 needs neither")
-    return Door(accounts, remote)
+    return AccessControl(accounts, remote)
 
 
 def _is_loopback(host: str) -> bool:
@@ -77,15 +77,15 @@ def _is_loopback(host: str) -> bool:
 
 
 @asynccontextmanager
-async def serving(arguments: argparse.Namespace, door: Any) -> AsyncIterator[tuple[Any, asyncio.Task[None]]]:
+async def serving(arguments: argparse.Namespace, access: Any) -> AsyncIterator[tuple[Any, asyncio.Task[None]]]:
     """Run a crystal, its server and page; yields the machine, and a task that ends only if the plant's thread fails."""
     from .machine import Clock, CrystalMachine, LogFile, Machine, StateFile
-    from .opcua import Tags, certify, pump
+    from .opcua import Tags, certify, publish_tags
     from .page import Page
 
     if arguments.log_size and not arguments.log:
         raise CzError("--log-size divides the file of --log, which is not named")
-    if door.remote:
+    if access.remote:
         await certify(arguments.certificates)
     log = LogFile(arguments.log, 1e6 * (arguments.log_size or math.inf)) if arguments.log else None
     state = StateFile(arguments.state) if arguments.state else None
@@ -100,16 +100,16 @@ async def serving(arguments: argparse.Namespace, door: Any) -> AsyncIterator[tup
     clock = Clock(
         machine, arguments.speed, arguments.wait, lambda tags: loop.call_soon_threadsafe(queue.put_nowait, tags)
     )
-    place = door, arguments.host, arguments.certificates
+    place = access, arguments.host, arguments.certificates
     async with Tags(machine, *place, arguments.port) as tags, Page(machine, *place, arguments.page_port):
-        pumping = asyncio.create_task(pump(tags, queue, clock))
+        publishing = asyncio.create_task(publish_tags(tags, queue, clock))
         clock.start()
         try:
-            yield machine, pumping
+            yield machine, publishing
         finally:
             clock.stopped.set()
             await asyncio.to_thread(clock.join)
-            pumping.cancel()
+            publishing.cancel()
 
 
 def _serve(arguments: argparse.Namespace) -> None:
@@ -117,7 +117,7 @@ def _serve(arguments: argparse.Namespace) -> None:
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)
 
     async def run() -> None:
-        async with serving(arguments, door_of(arguments)) as (_, pumping):
-            await pumping
+        async with serving(arguments, access_control(arguments)) as (_, publishing):
+            await publishing
 
     asyncio.run(run())

@@ -4,7 +4,6 @@ import io
 import json
 import math
 import os
-import pkgutil
 import threading
 import time
 from collections import deque
@@ -32,8 +31,9 @@ from cz_gym.support.files import check_writable, name_file_in_errors, write_file
 from cz_gym.support.names import leaves, map_arrays
 from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN
 from cz_gym.tools.export.block import INPUTS, OUTPUTS, SETPOINT_NAMES, in_plant_units, settings_of
-from cz_gym.tools.export.controllers import FALLBACK, REGISTRY, make_block
+from cz_gym.tools.export.controllers import FALLBACK, make_block
 from cz_gym.tools.identify.log import COLUMNS
+from cz_gym.tools.registry import make_controller
 
 SYNC = 0.5
 """Time after which a log waits for the disk, which takes longer than a step [s]."""
@@ -288,7 +288,7 @@ class Machine:
         """The numbers of the fallback's memory, one after the other."""
         return np.concatenate([np.ravel(each) for each in leaves(self._memory).values()])
 
-    def offer(self, writes: dict[str, Any]) -> dict[str, str]:
+    def write_setpoints(self, writes: dict[str, Any]) -> dict[str, str]:
         """Take a client's values, all or none; returns the reasons of those that are refused.
 
         Setpoints are stored. They act once the client writes the number of the step that they answer to ``watchdog``.
@@ -305,14 +305,14 @@ class Machine:
                     self.committed.notify_all()
             return reasons
 
-    def by_hand(self, setpoints: dict[str, float]) -> dict[str, str]:
+    def set_manual(self, setpoints: dict[str, float]) -> dict[str, str]:
         """Give the operator control with these setpoints, or, with none, give it back to the clients.
 
         Returns the reasons of those that are refused.
         """
         with self._lock:
             before, self.manual = self.manual, False
-            reasons = self.offer(setpoints)
+            reasons = self.write_setpoints(setpoints)
             self.manual = before if reasons else bool(setpoints)
             if not reasons:
                 self._act()
@@ -506,7 +506,7 @@ class CrystalMachine(Machine):
         return self._in_plant_units(seen._replace(**drives)) | shown
 
     def _make_fallback(self) -> Any:
-        return pkgutil.resolve_name(f"{REGISTRY}:make_controller")("compensated", self.config)
+        return make_controller("compensated", self.config)
 
     def _rest(self) -> Any:
         return self._fallback.predict(self._observation)[1]

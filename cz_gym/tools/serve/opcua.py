@@ -57,7 +57,7 @@ class Account(NamedTuple):
     writes: bool
 
 
-class Door(UserManager):  # type: ignore[misc]
+class AccessControl(UserManager):  # type: ignore[misc]
     """The accounts that may log in to the server and its page, and the list of what was refused.
 
     Without accounts everybody on this machine may read and write tags. With accounts only operators write; elsewhere
@@ -104,9 +104,9 @@ class Door(UserManager):  # type: ignore[misc]
 class Writes(AttributeService):  # type: ignore[misc]
     """Writes of clients: all values of a request are taken by the machine, or none."""
 
-    def __init__(self, server: Server, machine: Machine, door: Door, nodes: dict[ua.NodeId, str]) -> None:
+    def __init__(self, server: Server, machine: Machine, access: AccessControl, nodes: dict[ua.NodeId, str]) -> None:
         super().__init__(server.iserver.aspace)
-        self.machine, self.door, self.nodes = machine, door, nodes
+        self.machine, self.access, self.nodes = machine, access, nodes
 
     async def write(self, params: Any, user: Any = User(role=UserRole.Admin)) -> list[ua.StatusCode]:  # noqa: B008
         """Return a status for each value; the server's own writes pass."""
@@ -114,7 +114,7 @@ class Writes(AttributeService):  # type: ignore[misc]
             return await super().write(params, user)  # type: ignore[no-any-return]
         codes = [self._check(each, user.name) for each in params.NodesToWrite]
         wanted = {self.nodes[each.NodeId]: each.Value.Value.Value for each in params.NodesToWrite if not any(codes)}
-        reasons = self.machine.offer(wanted)
+        reasons = self.machine.write_setpoints(wanted)
         for at, each in enumerate(params.NodesToWrite):
             name = self.nodes.get(each.NodeId, str(each.NodeId))
             if name in reasons:
@@ -122,7 +122,7 @@ class Writes(AttributeService):  # type: ignore[misc]
             if codes[at]:
                 value = each.Value.Value.Value if each.Value.Value is not None else None
                 reason = reasons.get(name) or ua.StatusCode(codes[at]).name
-                self.door.refused(f"{user.name}: {name} = {value!r:.40}: {reason}")
+                self.access.refused(f"{user.name}: {name} = {value!r:.40}: {reason}")
         if any(codes):
             return [ua.StatusCode(code or ua.StatusCodes.BadInvalidState) for code in codes]
         for each in params.NodesToWrite:
@@ -142,9 +142,9 @@ class Writes(AttributeService):  # type: ignore[misc]
 class Tags:
     """The server with the machine's tags; :meth:`publish` shows new values."""
 
-    def __init__(self, machine: Machine, door: Door, host: str, certificates: Path, port: int) -> None:
-        self.machine, self.door, self.certificates = machine, door, certificates
-        self.server = Server(user_manager=door)
+    def __init__(self, machine: Machine, access: AccessControl, host: str, certificates: Path, port: int) -> None:
+        self.machine, self.access, self.certificates = machine, access, certificates
+        self.server = Server(user_manager=access)
         self.endpoint = f"opc.tcp://{in_address(host)}:{port}/"
         self.nodes: dict[str, ua.NodeId] = {}
 
@@ -155,7 +155,7 @@ class Tags:
         server.name = "Cz-v0 virtual puller"
         await server.set_application_uri(URI)
         aspace.max_connections = MOST_CLIENTS
-        if self.door.remote:
+        if self.access.remote:
             await server.load_certificate(self.certificates / "certificate.pem")
             await server.load_private_key(self.certificates / "key.pem")
             server.set_security_policy([ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt])
@@ -173,7 +173,7 @@ class Tags:
             if tag.writable:
                 await node.set_writable()
         names = {node_id: name for name, node_id in self.nodes.items()}
-        aspace.attribute_service = Writes(server, self.machine, self.door, names)
+        aspace.attribute_service = Writes(server, self.machine, self.access, names)
         try:
             await server.start()
         except OSError as error:
@@ -246,7 +246,7 @@ def password(role: str) -> str:
     return given
 
 
-async def pump(tags: Tags, queue: asyncio.Queue[dict[str, Any]], clock: Clock) -> None:
+async def publish_tags(tags: Tags, queue: asyncio.Queue[dict[str, Any]], clock: Clock) -> None:
     """Publish what the plant's thread sends; raises its error once it fails."""
     while values := await queue.get():
         await tags.publish(values)

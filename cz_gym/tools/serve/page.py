@@ -18,7 +18,7 @@ from cz_gym.support.errors import CzError
 from cz_gym.tools.export.block import SETPOINT_NAMES
 
 from .machine import Machine, PullerAlarm
-from .opcua import Account, Door, in_address
+from .opcua import AccessControl, Account, in_address
 
 HTML = Path(__file__).parent / "page.html"
 ASK = {"WWW-Authenticate": 'Basic realm="virtual puller", charset="UTF-8"'}
@@ -29,8 +29,8 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 class Page:
     """Serves the page beside the OPC UA server, with the same accounts; with TLS where that one is encrypted."""
 
-    def __init__(self, machine: Machine, door: Door, host: str, certificates: Path, port: int) -> None:
-        self.machine, self.door, self.place = machine, door, (host, port)
+    def __init__(self, machine: Machine, access: AccessControl, host: str, certificates: Path, port: int) -> None:
+        self.machine, self.access, self.place = machine, access, (host, port)
         self.certificates = certificates
         app = web.Application(middlewares=[self._guard], client_max_size=1000)
         app.add_routes([
@@ -45,7 +45,7 @@ class Page:
         host, port = self.place
         if port:
             context = None
-            if self.door.remote:
+            if self.access.remote:
                 context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
                 context.load_cert_chain(self.certificates / "certificate.pem", self.certificates / "key.pem")
             await self._runner.setup()
@@ -70,7 +70,7 @@ class Page:
         if account is None or (request.path == "/login" and not account.name):
             return web.Response(status=401, headers=ASK, text="log in")
         if writes and not (account.name and account.writes and request.content_type == "application/json"):
-            self.door.refused(f"{account.name or 'guest'}: {request.path} of the page")
+            self.access.refused(f"{account.name or 'guest'}: {request.path} of the page")
             return web.Response(status=403, text="only an operator who has logged in may write")
         response = await handler(request)
         response.headers.update(HEADERS)
@@ -90,8 +90,8 @@ class Page:
         try:
             given = BasicAuth.decode(request.headers["Authorization"], "utf-8")
         except (KeyError, ValueError):
-            return self.door.login(None, None)
-        return self.door.login(given.login, given.password)
+            return self.access.login(None, None)
+        return self.access.login(given.login, given.password)
 
     async def _html(self, _: web.Request) -> web.Response:
         return web.Response(text=HTML.read_text("utf-8"), content_type="text/html")
@@ -115,11 +115,11 @@ class Page:
             "now": now,
             "hour": [row for row in rows if row["step"] > after],
             "alarms": [alarm.name for alarm in PullerAlarm if now["alarms"] & alarm],
-            "events": list(self.door.events)[-5:],
+            "events": list(self.access.events)[-5:],
             "limits": self.machine.limits,
             "user": account.name,
             "writes": bool(account.name) and account.writes,
-            "accounts": bool(self.door.accounts),
+            "accounts": bool(self.access.accounts),
         })  # fmt: skip
 
     async def _crystal(self, _: web.Request) -> web.Response:
@@ -143,5 +143,5 @@ class Page:
         good = isinstance(given, dict) and set(given) in (set(), set(SETPOINT_NAMES))
         if not good or not all(type(value) in (int, float) for value in given.values()):
             return web.Response(status=400, text="two numbers, or none")
-        reasons = self.machine.by_hand(given)
+        reasons = self.machine.set_manual(given)
         return web.Response(status=400 if reasons else 200, text="; ".join(f"{n}: {r}" for n, r in reasons.items()))

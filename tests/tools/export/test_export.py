@@ -27,7 +27,7 @@ from cz_gym.tools.identify.log import record_log
 from cz_gym.tools.registry import make_controller
 from studies.export import LARGEST, report, study
 from studies.faults import FAULTS, grow
-from tests.machine.export.structured_text import FunctionBlock
+from tests.tools.export.structured_text import FunctionBlock
 
 CONTROLLERS = ("paper", "paper-tuned", "pid-conventional", "lqg", "gradient", "ppo")
 needs_compiler = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed: no C can be compiled")
@@ -547,7 +547,7 @@ def test_a_folder_holds_one_block(tmp_path, refused, capsys):
 def test_what_cannot_be_exported_is_refused_in_one_line(given, said, tmp_path, refused, monkeypatch):
     """A name that does not exist is refused before the fallback is searched, which takes seconds."""
     if "unknown" in said:
-        monkeypatch.setattr(controllers, "SEARCH", "no_search:at_all")
+        monkeypatch.setattr(controllers, "fallback", lambda _: pytest.fail("searched"))
     assert said in refused(main, [*given, "--to", "c", "--out", str(tmp_path / "out")])
     assert not (tmp_path / "out").exists()
 

@@ -23,10 +23,10 @@ def machine(watchdog=60.0, log=None, state=None, **settings):
 
 def test_setpoints_act_once_the_step_they_answer_is_written_and_not_before():
     one = machine()
-    assert one.offer({PULL: 1.5}) == {}
+    assert one.write_setpoints({PULL: 1.5}) == {}
     one.step()
     assert one.step()["pull_speed_mm_per_min"] == pytest.approx(1.2, abs=0.1), "the fallback's"
-    assert one.offer({PULL: 1.5, HEATER: 58.0, "watchdog": 2}) == {}
+    assert one.write_setpoints({PULL: 1.5, HEATER: 58.0, "watchdog": 2}) == {}
     tags = one.step()
     assert tags["pull_speed_mm_per_min"] == pytest.approx(1.5)
     assert tags["heater_power_kW"] == pytest.approx(58.0)
@@ -37,11 +37,11 @@ def test_a_refused_value_refuses_all_that_came_with_it():
     one = machine()
     low, high = one.limits[HEATER]
     for bad in (math.nan, math.inf, -math.inf, high + 1e-3, low - 1e-3):
-        assert list(one.offer({PULL: 1.5, HEATER: bad, "watchdog": 0})) == [HEATER]
+        assert list(one.write_setpoints({PULL: 1.5, HEATER: bad, "watchdog": 0})) == [HEATER]
     assert one.answered == -1
-    assert one.offer({PULL: one.limits[PULL][1], HEATER: low, "watchdog": 0}) == {}
+    assert one.write_setpoints({PULL: one.limits[PULL][1], HEATER: low, "watchdog": 0}) == {}
     for step in (0, 1):
-        assert list(one.offer({"watchdog": step})) == ["watchdog"], "answered, and not begun"
+        assert list(one.write_setpoints({"watchdog": step})) == ["watchdog"], "answered, and not begun"
 
 
 def test_applied_drives_are_shown_within_their_limits():
@@ -49,7 +49,7 @@ def test_applied_drives_are_shown_within_their_limits():
     one = machine(puller=PullerFile(pull_window=0.1 / 6e4, heater_range=1234.5))
     for end in (0, 1):
         setpoints = {name: float(np.float32(limits[end])) for name, limits in one.limits.items()}
-        assert one.offer(setpoints | {"watchdog": one.k}) == {}, "rounding of a Float is forgiven"
+        assert one.write_setpoints(setpoints | {"watchdog": one.k}) == {}, "rounding of a Float is forgiven"
         row = one.step()
         for applied, (low, high) in zip(("pull_speed_mm_per_min", "heater_power_kW"), one.limits.values(), strict=True):
             assert low <= row[applied] <= high
@@ -60,7 +60,7 @@ def drive(one, steps):
     """Half of the steps have setpoints of a client; the others are held, or the fallback's."""
     for _ in range(steps):
         if one.k % 40 < 20:
-            one.offer({PULL: 1.2 + 0.001 * (one.k % 7), "watchdog": one.k})
+            one.write_setpoints({PULL: 1.2 + 0.001 * (one.k % 7), "watchdog": one.k})
         one.step()
     return list(one.hour)
 
@@ -104,7 +104,7 @@ def test_a_state_of_other_settings_or_a_damaged_one_is_refused_in_one_line(tmp_p
 
 def test_setpoints_that_are_not_renewed_are_held_and_then_the_fallback_takes_over_without_a_jump():
     one = machine(watchdog=30.0)
-    one.offer({PULL: 1.5, HEATER: 57.5, "watchdog": 0})
+    one.write_setpoints({PULL: 1.5, HEATER: 57.5, "watchdog": 0})
     rows = [one.step() for _ in range(8)]
     assert [row["control"] for row in rows] == ["client", *["held"] * 5, *["fallback"] * 2]
     assert [row["alarms"] for row in rows] == [0, *[PullerAlarm.HELD] * 5, *[PullerAlarm.FALLBACK] * 2]
@@ -115,26 +115,26 @@ def test_setpoints_that_are_not_renewed_are_held_and_then_the_fallback_takes_ove
     assert moves.max() < 0.25
     assert all(row["state"] == "growing" for row in rows)
     assert abs(rows[-1]["ring_radius_mm"] - rows[-1]["ring_bias_mm"] - rows[-1]["r_ref_mm"]) < 1.5
-    one.offer({PULL: 1.3, HEATER: 57.0, "watchdog": 1908})
+    one.write_setpoints({PULL: 1.3, HEATER: 57.0, "watchdog": 1908})
     assert one.step()["control"] == "client"
 
 
 def test_the_operator_takes_control_and_gives_it_back():
     one = machine(watchdog=10.0)
-    assert list(one.by_hand({PULL: 9.0, HEATER: 57.0})) == [PULL]
-    assert one.by_hand({PULL: 1.4, HEATER: 57.0}) == {}
-    assert one.offer({"watchdog": 0}) == {"watchdog": "the operator has control"}
+    assert list(one.set_manual({PULL: 9.0, HEATER: 57.0})) == [PULL]
+    assert one.set_manual({PULL: 1.4, HEATER: 57.0}) == {}
+    assert one.write_setpoints({"watchdog": 0}) == {"watchdog": "the operator has control"}
     rows = [one.step() for _ in range(10)]
     assert {(row["control"], row["alarms"]) for row in rows} == {("manual", PullerAlarm.MANUAL)}
     assert [row["pull_speed_mm_per_min"] for row in rows] == pytest.approx([1.4] * 10)
-    assert one.by_hand({}) == {}
+    assert one.set_manual({}) == {}
     assert [one.step()["control"] for _ in range(3)] == ["held", "fallback", "fallback"]
 
 
 def test_a_lost_crystal_raises_an_alarm():
     one = machine()
     while not one.over:
-        one.offer({PULL: 0.0, "watchdog": one.k})
+        one.write_setpoints({PULL: 0.0, "watchdog": one.k})
         tags = one.step()
     assert tags["alarms"] & PullerAlarm.ENDED
     assert "frozen" in tags["state"] or "lost" in tags["state"]
@@ -153,7 +153,7 @@ def test_a_clock_makes_up_for_what_it_missed_and_does_not_drift():
     clock.start()
     time.sleep(0.1)
     assert one.k == 0, "it waits for the first setpoints"
-    one.offer({"watchdog": 0})
+    one.write_setpoints({"watchdog": 0})
     begin = time.monotonic()
     while one.k < 120:
         time.sleep(0.001)
@@ -201,11 +201,11 @@ def test_setpoints_of_a_crystal_are_absolute_and_those_of_the_recipe_follow_it()
     one = CrystalMachine(config, 1, 60.0)
     for _ in range(200):
         recipe = [one.hour[-1][name] for name in ("pull_speed_recipe_mm_per_min", "heater_power_recipe_kW")]
-        assert one.offer(dict(zip(SETPOINT_NAMES, recipe, strict=True)) | {"watchdog": one.k}) == {}
+        assert one.write_setpoints(dict(zip(SETPOINT_NAMES, recipe, strict=True)) | {"watchdog": one.k}) == {}
         row = one.step()
         assert [row[applied] for applied in SETPOINT_NAMES.values()] == pytest.approx(recipe, rel=1e-6)
         assert row["ring_radius_mm"] - row["ring_bias_mm"] == pytest.approx(row["r_ref_mm"], abs=0.05)
-    assert one.offer({PULL: 2.0, HEATER: 50.0, "watchdog": one.k}) == {}
+    assert one.write_setpoints({PULL: 2.0, HEATER: 50.0, "watchdog": one.k}) == {}
     row = one.step()
     assert (row["pull_speed_mm_per_min"], row["heater_power_kW"]) == pytest.approx((2.0, 50.0))
-    assert list(one.offer({PULL: 4.0})) == [PULL]
+    assert list(one.write_setpoints({PULL: 4.0})) == [PULL]

@@ -13,7 +13,7 @@ pytest.importorskip("asyncua", reason="asyncua is absent: pip install '.[plant]'
 from asyncua import Client, ua
 from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 
-from cz_gym.tools.serve.command import commands, door_of, serving
+from cz_gym.tools.serve.command import access_control, commands, serving
 from cz_gym.tools.serve.machine import TAGS
 from cz_gym.tools.serve.opcua import KINDS, URI
 
@@ -36,9 +36,9 @@ def running(folder, *options, remote=False):
     ready, done = threading.Event(), threading.Event()
 
     async def serve():
-        puller.door = door_of(arguments)
-        puller.door.remote = remote
-        async with serving(arguments, puller.door) as (puller.machine, _):
+        puller.access = access_control(arguments)
+        puller.access.remote = remote
+        async with serving(arguments, puller.access) as (puller.machine, _):
             ready.set()
             await asyncio.to_thread(done.wait)
 

@@ -19,8 +19,8 @@ import pytest
 from cz_gym.tools.export.block import SETPOINT_NAMES
 from cz_gym.tools.identify.log import read_log
 from cz_gym.tools.serve import command
-from tests.machine.serve.conftest import PASSWORD, answer, connected, free_port, running, with_client
 from tests.processes import ROOT
+from tests.tools.serve.conftest import PASSWORD, answer, connected, free_port, running, with_client
 
 from asyncua import ua  # isort: skip
 
@@ -63,7 +63,7 @@ def test_values_of_wrong_type_or_size_are_refused_and_logged(puller):
         assert low <= await hand.read(PULL) <= high, "nothing that was refused is kept"
 
     with_client(puller.url, act)
-    assert any(f"{HEATER} = nan" in line for line in puller.door.events)
+    assert any(f"{HEATER} = nan" in line for line in puller.access.events)
 
 
 @pytest.mark.parametrize(("kind", "value"), [("Float", 1.31), ("Double", 1.32), ("Int16", 1), ("UInt64", 2)])
@@ -129,7 +129,7 @@ def test_ten_clients_at_once_of_which_one_floods_and_no_step_is_late(puller):
     assert puller.machine.k - first == pytest.approx(expected, abs=40)
     assert min(found[:9]) > 5
     assert found[9] == 1000
-    assert len(puller.door.events) <= 100
+    assert len(puller.access.events) <= 100
 
 
 def test_a_client_that_dies_in_the_middle_of_a_message_leaves_all_as_it_was(puller):
@@ -220,7 +220,7 @@ def test_elsewhere_nobody_reads_without_an_account_and_encryption(locked):
             encrypted(locked, lambda hand: hand.read("step"), user, password)
     with pytest.raises((ua.UaError, ConnectionError, TimeoutError)):
         with_client(locked.url, lambda hand: hand.read("step"), "olga")
-    assert any("login as 'olga'" in line for line in locked.door.events)
+    assert any("login as 'olga'" in line for line in locked.access.events)
 
 
 def test_a_reader_reads_and_an_operator_writes(locked):
@@ -230,7 +230,7 @@ def test_a_reader_reads_and_an_operator_writes(locked):
 
     assert encrypted(locked, act, "rita", PASSWORD)[1] == ["BadUserAccessDenied"] * 3
     assert encrypted(locked, act, "olga", PASSWORD)[1] == ["Good"] * 3
-    assert any(line.endswith(f"reader rita: {PULL} = 1.2: BadUserAccessDenied") for line in locked.door.events)
+    assert any(line.endswith(f"reader rita: {PULL} = 1.2: BadUserAccessDenied") for line in locked.access.events)
     files = {file.name: file.stat().st_mode & 0o077 for file in (locked.folder / "certificates").iterdir()}
     assert files == {"certificate.pem": 0, "key.pem": 0}
 
