@@ -14,10 +14,9 @@ import numpy as np
 
 from cz_gym.body.process import BODY
 from cz_gym.camera.view import Camera, camera_for, check_camera
-from cz_gym.episodes.adapt import adapt_scenario
 from cz_gym.episodes.draw import Factors
 from cz_gym.episodes.scenario import AnyScenario, Distribution, Scenario
-from cz_gym.episodes.scenarios import RANDOMIZED, find_distribution, find_scenario, mix_of
+from cz_gym.episodes.scenarios import RANDOMIZED, adapt_scenario, find_distribution, find_scenario, mix_of
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.quantities import Range
@@ -165,7 +164,7 @@ class Config:
         )
 
     def with_scenario(self, scenario: AnyScenario) -> Self:
-        """The same settings on another scenario or mixture."""
+        """The same settings on another scenario or mixture, which is adapted to the puller."""
         return replace(self, scenario=adapt_scenario(self.puller, find_distribution(scenario)))
 
 

@@ -1,43 +1,38 @@
-"""The environment: ``gym.make("Cz-v0")``."""
+"""The environments ``Cz-v0``, a body, and ``CzCrystal-v0``, a whole crystal: each scalar, and as a native batch.
+
+``gym.make("Cz-v0")`` makes a :class:`CzEnv`, ``gym.make_vec("Cz-v0", vectorization_mode="vector_entry_point")`` a
+:class:`CzVectorEnv`. Both are thin shells over :class:`cz_gym.engine.batch.Batch`: arguments are checked by
+:func:`cz_gym.config.make_config`, slots hold the crystals.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Self
 
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 from gymnasium.error import InvalidAction, ResetNeeded
-from gymnasium.spaces import Box
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from cz_gym.body.process import BODY
-from cz_gym.camera.view import IMAGE, Camera
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.engine.batch import Batch, SlotState, new_key, processors
 from cz_gym.engine.slots import Out, check_info
-from cz_gym.episodes.scenario import AnyScenario, Mixture
-from cz_gym.episodes.scenarios import find_distribution
-from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.physics.parameters import Parameters
-from cz_gym.puller.file import PullerFile
+from cz_gym.episodes.scenario import Distribution, Mixture
 from cz_gym.rendering.canvas import Frame
-from cz_gym.rendering.view import FPS, declared_modes, make_view
+from cz_gym.rendering.view import FPS, View, declared_modes, make_view
 from cz_gym.support.errors import CzError
 from cz_gym.support.names import check_keywords, unknown_name_message
 
 from .config import Config, check_config, make_config, positive_whole
-from .process import Process
-from .spaces import CAMERA, CLIP, TaggedAction, check_tagged, observations
+from .spaces import TaggedAction, action_space, check_action, check_tagged, observation_space
 
-Observation = npt.NDArray[Any]
-Action = npt.NDArray[np.float32]
-_OPTIONS = ("scenario", "state")
+Array = npt.NDArray[Any]
+Mask = npt.NDArray[np.bool_]
 _PLAIN = np.float64, np.bool_, float, bool, str
 
 
@@ -49,43 +44,16 @@ class EnvState:
     random: dict[str, Any]
 
 
-def action_space() -> Any:
-    """Pull speed and heater power, each in [-1, 1]: v_p = v_0 (1 + a_0), Q_H = Q_H0 + 10 kW a_1."""
-    return Box(-1.0, 1.0, (2,), np.float32)
-
-
-def observation_space(observation: str, process: Process = BODY) -> Any:
-    """The observation's channels, scaled and clipped to +-10, or the camera's grey values."""
-    if observation == CAMERA:
-        return Box(0, 255, IMAGE, np.uint8)
-    return Box(-CLIP, CLIP, (len(observations(process)[observation]),), np.float32)
-
-
-def check_options(options: dict[str, Any] | None, allowed: tuple[str, ...] = _OPTIONS) -> dict[str, Any]:
-    """Return reset's options with the scenario as an object; raise CzError for unknown or conflicting ones."""
-    if options is not None and not isinstance(options, Mapping):
-        raise CzError(f"reset options must be a dict, not {options!r}")
-    given = dict(options or {})
-    for key in given:
-        if key not in allowed:
-            raise CzError(unknown_name_message("reset option", key, allowed))
-    if "scenario" in given and "state" in given:
-        raise CzError("reset options 'scenario' and 'state' exclude each other: a state has its own episode")
-    if "scenario" in given:
-        given["scenario"] = find_distribution(given["scenario"])
-    return given
-
-
 class EnvBase:
     """Base of the scalar and the batched environment: construction from a config, and pickling."""
 
     FACTS: tuple[str, ...] = ("_over", "_begun", "_named", "spec", "action_space", "observation_space")
     """Attributes that are pickled besides settings and slots."""
+    config: Config
+    """The checked settings."""
     _setup: Any
     _settings: tuple[Any, ...]
-    _batch: Batch
-    _out: Out
-    _begun: bool
+    _view: View | None = None
 
     @classmethod
     def from_config(cls, config: Config, *settings: Any, **named: Any) -> Self:
@@ -97,6 +65,38 @@ class EnvBase:
         env = cls.__new__(cls)
         env._setup(check_config(config), *settings, **named)
         return env
+
+    def _prepare(self, config: Config, num_envs: int, threads: int, everything: bool, recorded: bool = False) -> None:
+        """Make the slots; ``recorded``: all rows of ``info`` are written, whether or not they are returned."""
+        self.config, self._made_for, self._everything = config, config.made_for, everything
+        self._batch = Batch(config, num_envs, threads, everything or recorded)
+        self._out = self._batch.new_out()
+        self._begun, self._named = False, isinstance(config.scenario, Mixture)
+
+    def _checked(self, options: dict[str, Any] | None, *allowed: str) -> dict[str, Any]:
+        """Return reset's options, the scenario on the puller; raise CzError for unknown or conflicting ones."""
+        if options is not None and not isinstance(options, Mapping):
+            raise CzError(f"reset options must be a dict, not {options!r}")
+        given = dict(options or {})
+        for key in given:
+            if key not in allowed:
+                raise CzError(unknown_name_message("reset option", key, allowed))
+        if "scenario" in given and "state" in given:
+            raise CzError("reset options 'scenario' and 'state' exclude each other: a state has its own episode")
+        if "scenario" in given:
+            given["scenario"] = self.config.with_scenario(given["scenario"]).scenario
+        return given
+
+    def _check_state(self, state: Any) -> None:
+        """Raise CzError unless a slot of this environment can continue from the state."""
+        if not isinstance(state, EnvState):
+            raise CzError(f"expected a state made by get_state, not {type(state).__name__}")
+        self._batch.check(state.slot)
+        try:
+            random: Any = np.random.PCG64(0)
+            random.state = state.random
+        except (ValueError, TypeError, KeyError, OverflowError):
+            raise CzError("this state is damaged: its random stream is not one of PCG64") from None
 
     def __getstate__(self) -> dict[str, Any]:
         """The settings, the state of every slot, and the attributes named in ``FACTS``."""
@@ -112,10 +112,12 @@ class EnvBase:
             setattr(self, name, fact)
 
     def _restart_view(self) -> None:
-        """Restart the record of the picture; only the scalar form has one."""
+        """Restart the record of the picture, where there is one."""
+        if self._view is not None:
+            self._view.begin(self._out.info[:, 0], self._batch.memory.slots[0], self._batch.scenarios[0])
 
 
-class CzEnv(EnvBase, gym.Env[Observation, Action]):
+class CzEnv(EnvBase, gym.Env[Array, Array]):
     """Czochralski growth of a silicon ingot: hold the true radius, seeing only the camera's bright ring.
 
     ## Action Space
@@ -168,90 +170,52 @@ class CzEnv(EnvBase, gym.Env[Observation, Action]):
 
     def __init__(
         self,
-        scenario: AnyScenario = "randomized",
-        model: str | float | None = None,
-        observation: str = "history",
-        control_interval: float | None = None,
-        horizon: float | None = None,
+        *settings: Any,
         render_mode: str | None = None,
-        parameters: Parameters | None = None,
-        meniscus: MeniscusModel | None = None,
         render_size: tuple[int, int] = (640, 480),
-        camera: Camera | None = None,
-        action: str = "smooth",
         info: str = "lean",
-        puller: str | Path | PullerFile | None = None,
-        process: Process | None = None,
-        weights: Mapping[str, float] | None = None,
-        stage: Any = None,
-        **others: Any,
+        **named: Any,
     ) -> None:
-        check_keywords(others, type(self).__init__, CzEnv.__init__)
-        config = make_config(
-            scenario,
-            model,
-            observation,
-            control_interval,
-            horizon,
-            parameters,
-            meniscus,
-            camera,
-            action,
-            puller,
-            process,
-            weights,
-            stage,
-        )
-        self._setup(config, render_mode, render_size, info)
+        check_keywords(named, make_config, CzEnv.__init__)
+        self._setup(make_config(*settings, **named), render_mode, render_size, info)
 
     def _setup(
-        self,
-        config: Config,
-        render_mode: str | None = None,
-        render_size: tuple[int, int] = (640, 480),
-        info: str = "lean",
+        self, config: Config, render_mode: str | None = None, render_size: Any = (640, 480), info: str = "lean"
     ) -> None:
-        self._everything, self._settings = check_info(info), (config, render_mode, render_size, info)
-        self.config, self._made_for = config, config.made_for
+        self._settings = config, render_mode, render_size, info
+        self._prepare(config, 1, 1, check_info(info), recorded=render_mode is not None)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_modes": declared_modes(config.process)}
         self.action_space = action_space()
         self.observation_space = observation_space(config.observation, config.process)
-        self._batch = Batch(self.config, 1, everything=self._everything or render_mode is not None)
-        self._slots = self._batch.memory.slots
-        self._out = self._batch.new_out()
-        self._action = np.zeros((1, 2))
+        self._over, self._slots, self._action = True, self._batch.memory.slots, np.zeros((1, 2))
         self._shown = self._batch.shown(self._out)[0]
         self._signals, self._valid = self._out.info[:, 0], self._slots["valid"]
         self._step = self._batch.bound_step(self._action, self._out)
-        self._over, self._begun, self._named = True, False, isinstance(config.scenario, Mixture)
-        names = config.process.info
-        self._names, self._clipped = names, names.index("action_clipped")
-        self._lean = tuple((name, names.index(name)) for name in config.process.BriefInfo._fields)
+        self._names, self._clipped = config.process.info, config.process.info.index("action_clipped")
+        self._lean = tuple((name, self._names.index(name)) for name in config.process.BriefInfo._fields)
         self._view = make_view(render_mode, render_size, self.config)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Draw an episode; see :class:`gymnasium.Env`.
 
         ``options={"scenario": ...}`` draws this one episode from another scenario or mixture;
         ``options={"state": ...}`` goes on from a value of :meth:`get_state`. Raises ValueError for other options.
         """
-        given = check_options(options)
+        given = self._checked(options, "scenario", "state")
         if "state" in given:
-            check_state(given["state"], self._batch)
+            self._check_state(given["state"])
         super().reset(seed=seed)
         if "state" in given:
             self.set_state(given["state"])
         else:
             self._batch.reset([0], [new_key(self.np_random)], self._out, given.get("scenario"))
-            self._named = self._named or isinstance(given.get("scenario"), Mixture)
+            self._named |= isinstance(given.get("scenario"), Mixture)
             self._restart_view()
         self._over, self._begun = bool(self._slots["over"][0]), True
         return self._shown.copy(), self._info()
 
-    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Hold an action, shape (2,), for one control interval; see :class:`gymnasium.Env`.
 
         Raises InvalidAction for NaN, another shape, and an action made for another environment (:mod:`cz_gym.spaces`);
@@ -281,7 +245,7 @@ class CzEnv(EnvBase, gym.Env[Observation, Action]):
 
     def set_state(self, state: EnvState) -> None:
         """Continue from a value of :meth:`get_state`; ValueError if it was saved under other settings."""
-        check_state(state, self._batch)
+        self._check_state(state)
         self._batch.restore([0], [state.slot], self._out)
         self.np_random.bit_generator.state = state.random
         self._restart_view()
@@ -302,10 +266,6 @@ class CzEnv(EnvBase, gym.Env[Observation, Action]):
         if self._view is not None:
             self._view.close()
         self._batch.close()
-
-    def _restart_view(self) -> None:
-        if self._view is not None:
-            self._view.begin(self._signals, self._slots[0], self._batch.scenarios[0])
 
     def _info(self) -> dict[str, Any]:
         if self._everything:
@@ -334,38 +294,6 @@ class Info(dict[str, Any]):
         return type(self)(self)
 
 
-def check_state(state: Any, batch: Batch) -> None:
-    """Raise CzError unless a slot of this batch can continue from the state."""
-    if not isinstance(state, EnvState):
-        raise CzError(f"expected a state made by get_state, not {type(state).__name__}")
-    batch.check(state.slot)
-    try:
-        random: Any = np.random.PCG64(0)
-        random.state = state.random
-    except (ValueError, TypeError, KeyError, OverflowError):
-        raise CzError("this state is damaged: its random stream is not one of PCG64") from None
-
-
-def check_action(action: Any) -> Any:
-    """Return the action as float64, shape (2,); raise InvalidAction for anything else."""
-    try:
-        array = np.asarray(action, np.float64)
-    except (TypeError, ValueError):
-        raise InvalidAction(f"an action must be two numbers in [-1, 1], not {action!r}") from None
-    if array.shape != (2,):
-        raise InvalidAction(f"an action must have shape (2,), not {array.shape}")
-    pull, heat = array.tolist()
-    if pull != pull or heat != heat:
-        raise InvalidAction(f"an action must not be NaN: {action!r}")
-    return array
-
-
-# The native batch of environments: ``gym.make_vec("Cz-v0", vectorization_mode="vector_entry_point")``.
-
-Array = npt.NDArray[Any]
-Mask = npt.NDArray[np.bool_]
-
-
 class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
     """Many pullers at once in one compiled loop; slot i with seed s equals :class:`CzEnv` with seed s bit for bit.
 
@@ -381,16 +309,15 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
     def __init__(
         self,
         num_envs: int = 1,
-        scenario: AnyScenario = "randomized",
-        *,
+        *settings: Any,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
         info: str = "lean",
         render_mode: str | None = None,
-        **settings: Any,
+        **named: Any,
     ) -> None:
-        check_keywords(settings, make_config, CzVectorEnv.__init__)
-        config = make_config(scenario, **settings)
+        check_keywords(named, make_config, CzVectorEnv.__init__)
+        config = make_config(*settings, **named)
         if render_mode is not None:
             raise CzError(f"a batch does not render: render_mode must be None, not {render_mode!r}")
         self._setup(config, num_envs, autoreset_mode, threads, info)
@@ -403,28 +330,23 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         threads: int | None = None,
         info: str = "lean",
     ) -> None:
-        self._everything, self._settings = check_info(info), (config, num_envs, autoreset_mode, threads, info)
-        num_envs = positive_whole("num_envs", num_envs)
+        self._settings, everything = (config, num_envs, autoreset_mode, threads, info), check_info(info)
+        self.num_envs = num_envs = positive_whole("num_envs", num_envs)
         threads = processors() if threads is None else positive_whole("threads", threads)
-        self.config, self._made_for = config, config.made_for
-        self.render_mode = None
-        self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.render_mode = None
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_action_space = action_space()
         self.single_observation_space = observation_space(config.observation, config.process)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        rows, lean = config.process.info, config.process.BriefInfo._fields
-        self._clipped, self._names = rows.index("action_clipped"), rows if self._everything else lean
+        self._prepare(config, num_envs, threads, everything)
+        rows = config.process.info
+        self._clipped, self._names = rows.index("action_clipped"), rows if everything else config.process.BriefInfo._fields
         self._rows = tuple(map(rows.index, self._names))
         self._masks = tuple(f"_{name}" for name in self._names)
-        self._batch = Batch(self.config, num_envs, threads, self._everything)
-        self._out = self._batch.new_out()
         self._everybody: Mask = np.ones(num_envs, np.bool_)
-        self._over = self._everybody.copy()
-        self._waiting = True
-        self._begun, self._named = False, isinstance(config.scenario, Mixture)
+        self._over, self._waiting = self._everybody.copy(), True
         self._randoms: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
 
@@ -437,20 +359,23 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         on from a value of :meth:`get_state`, ``{"reset_mask": mask}`` resets only some slots. Raises ValueError or
         TypeError for anything else.
         """
-        given = check_options(options, ("scenario", "state", "reset_mask"))
+        given = self._checked(options, "scenario", "state", "reset_mask")
         mask = self._reset_mask(given.get("reset_mask"))
         if "state" in given:
             self._check_states(given["state"])
         self._seed(seed, mask)
         previous, self._out = self._out, self._batch.new_out()
         if not mask.all():
-            self._keep(previous, ~mask)
+            kept = np.flatnonzero(~mask)
+            for name, old, new in zip(previous._fields, previous, self._out, strict=True):
+                index = (slice(None), kept) if name == "info" else kept
+                new[index] = old[index]
         which = np.flatnonzero(mask).tolist()
         if "state" in given:
             self._restore(given["state"], which)
         else:
-            self._batch.reset(which, (new_key(self._random(i)) for i in which), self._out, given.get("scenario"))
-            self._named = self._named or isinstance(given.get("scenario"), Mixture)
+            self._draw(which, self._out, given.get("scenario"))
+            self._named |= isinstance(given.get("scenario"), Mixture)
         self._begin()
         return self._observations(), self._infos(self._out, mask)
 
@@ -472,14 +397,14 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         infos: dict[str, Any] = {}
         if waiting:
             ended = self._batch.step(actions, out, ~self._over) > 0
-            self._redraw(np.flatnonzero(self._over).tolist(), out)
+            self._draw(np.flatnonzero(self._over).tolist(), out)
         else:
             ended = self._batch.step(actions, out) > 0
         over = out.terminated | out.truncated if ended else np.zeros(self.num_envs, np.bool_)
         if self.autoreset_mode == AutoresetMode.SAME_STEP and ended:
             infos = self._finals(out, over)
             reward, terminated, truncated = out.reward.copy(), out.terminated.copy(), out.truncated.copy()
-            self._redraw(np.flatnonzero(over).tolist(), out)
+            self._draw(np.flatnonzero(over).tolist(), out)
             out = self._out = out._replace(reward=reward, terminated=terminated, truncated=truncated)
             over, ended = np.zeros_like(over), False
         self._over, self._waiting = over, ended
@@ -571,25 +496,19 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
             raise InvalidAction(f"actions must not be NaN; those of slots {slots} are")
         return array
 
-    def _redraw(self, which: list[int], out: Out) -> None:
-        self._batch.reset(which, (new_key(self._random(i)) for i in which), out)
+    def _draw(self, which: list[int], out: Out, given: Distribution | None = None) -> None:
+        self._batch.reset(which, (new_key(self._random(i)) for i in which), out, given)
 
     def _check_states(self, states: Any) -> None:
         if not isinstance(states, Sequence) or len(states) != self.num_envs:
             raise CzError(f"expected {self.num_envs} states made by get_state, one a slot")
         for state in states:
-            check_state(state, self._batch)
+            self._check_state(state)
 
     def _restore(self, states: Sequence[EnvState], which: list[int]) -> None:
         self._batch.restore(which, [states[i].slot for i in which], self._out)
         for i in which:
             self._random(i).bit_generator.state = states[i].random
-
-    def _keep(self, previous: Out, kept: Mask) -> None:
-        which = np.flatnonzero(kept)
-        for name, old, new in zip(previous._fields, previous, self._out, strict=True):
-            index = (slice(None), which) if name == "info" else which
-            new[index] = old[index]
 
     def _observations(self) -> Array:
         array: Array = self._batch.shown(self._out)
@@ -621,9 +540,6 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
             infos["state"] = out.state if whole else np.where(mask[:, None], out.state, np.float32(0))
             infos["_state"] = mask
         return infos
-
-
-# The environment of a whole crystal: ``gym.make("CzCrystal-v0")``, scalar and as a native batch.
 
 
 class CzCrystalEnv(CzEnv):

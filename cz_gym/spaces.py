@@ -7,10 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from gymnasium.error import InvalidAction
+from gymnasium.spaces import Box
 
 from cz_gym.body.process import BODY
 from cz_gym.body.signals import PREVIEWS as PREVIEWS
 from cz_gym.body.signals import Measured as Measured
+from cz_gym.camera.view import IMAGE
 from cz_gym.support.errors import CzError
 
 from .process import HEATER_SCALE, PULL_SCALE, Process
@@ -70,6 +72,25 @@ def drives_of(
     share = control_interval / SMOOTH_TIME
     keep, share = (1.0, share) if action == "rate" else (math.exp(-share), 1.0 - math.exp(-share))
     return Drives(keep, SMOOTH_PULL * share, SMOOTH_HEATER * share, speed, heater_range)
+
+
+def action_space() -> Any:
+    """Pull speed and heater power, each in [-1, 1]: v_p = v_0 (1 + a_0), Q_H = Q_H0 + 10 kW a_1."""
+    return Box(-1.0, 1.0, (2,), np.float32)
+
+
+def check_action(action: Any) -> Any:
+    """Return the action as float64, shape (2,); raise InvalidAction for anything else."""
+    try:
+        array = np.asarray(action, np.float64)
+    except (TypeError, ValueError):
+        raise InvalidAction(f"an action must be two numbers in [-1, 1], not {action!r}") from None
+    if array.shape != (2,):
+        raise InvalidAction(f"an action must have shape (2,), not {array.shape}")
+    pull, heat = array.tolist()
+    if pull != pull or heat != heat:
+        raise InvalidAction(f"an action must not be NaN: {action!r}")
+    return array
 
 
 class TargetEnv(NamedTuple):
@@ -188,6 +209,13 @@ OBSERVATIONS = observations(BODY)
 MEASURED, HISTORY, STATE = (OBSERVATIONS[name] for name in ("measured", "history", "state"))
 CAMERA = "camera"
 """The observation that is an image instead of channels (:mod:`cz_gym.camera`)."""
+
+
+def observation_space(observation: str, process: Process = BODY) -> Any:
+    """The observation's channels, scaled and clipped to +-10, or the camera's grey values."""
+    if observation == CAMERA:
+        return Box(0, 255, IMAGE, np.uint8)
+    return Box(-CLIP, CLIP, (len(observations(process)[observation]),), np.float32)
 
 
 def decode(

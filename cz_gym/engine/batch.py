@@ -16,7 +16,6 @@ from gymnasium.utils import seeding
 from cz_gym.camera.image import build_render
 from cz_gym.camera.view import IMAGE, make_view
 from cz_gym.config import Config, Identity
-from cz_gym.episodes.adapt import adapt_scenario
 from cz_gym.episodes.draw import ScenarioTable, scenario_table
 from cz_gym.episodes.scenario import GRID, Distribution, series_table
 from cz_gym.jit import entry
@@ -175,11 +174,9 @@ class Batch:
     def reset(self, which: Sequence[int], keys: Iterable[Key], out: Out, given: Distribution | None = None) -> None:
         """Draw new episodes for the slots ``which`` and write their first sample into ``out``.
 
-        They are drawn from the given scenario or mixture, by default the batch's own.
-
-        A puller without a finite operating point is drawn again; ValueError if none is found.
+        They are drawn from the given scenario or mixture, which must be on the batch's puller; by default from its
+        own. A puller without a finite operating point is drawn again; ValueError if none is found.
         """
-        given = None if given is None else adapt_scenario(self.config.puller, given)
         if given and any(each.series for each in (*given.scenarios, *self.config.scenario.scenarios)):
             raise CzError("series of a log come with the environment: make it with that scenario, not its reset")
         lots = self._lots if given is None else scenario_table(given, self.config.model)
