@@ -89,6 +89,16 @@ class Inputs(NamedTuple):
     """Heater power [W]."""
 
 
+@jittable
+def read_drives(u: Any, slot: Any) -> Any:
+    """Readings of the applied drives u: scale and offset of the episode, and what resolution and delay change."""
+    e = slot.episode
+    return Inputs(
+        e.pull_scale * u.v_p + e.pull_offset + slot.v_p_misread,
+        e.heater_scale * u.Q_H + e.heater_offset + slot.Q_H_misread,
+    )
+
+
 class PerfectReadings(NamedTuple):
     """Readings of noise-free sensors."""
 

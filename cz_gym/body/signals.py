@@ -10,7 +10,7 @@ import numpy as np
 
 from cz_gym.jit import jittable
 from cz_gym.physics.schedule import bias_offset, recipe, reference
-from cz_gym.process import HEATER_SCALE, PULL_SCALE, Past, Relative, signals
+from cz_gym.process import HEATER_SCALE, PULL_SCALE, Past, Relative, read_drives, signals
 from cz_gym.process import Channel as Channel
 from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
@@ -165,7 +165,7 @@ class Measured(NamedTuple):
 @jittable
 def measure(x: Any, u: Any, nominal: Any, memory: Any, readings: Any, slot: Any, t: Any) -> Any:
     """:class:`Measured` of a slot at its sample's time t [s]."""
-    p, e = slot.puller, slot.episode
+    p, e, read = slot.puller, slot.episode, read_drives(u, slot)
     r_ref = reference(t, e)
     return Measured(
         ring_error=readings.ring - p.r_0 - r_ref,
@@ -177,9 +177,9 @@ def measure(x: Any, u: Any, nominal: Any, memory: Any, readings: Any, slot: Any,
         T_1_ref_1min=recipe(t + _IN_1_MIN, e),
         T_1_ref_5min=recipe(t + _IN_5_MIN, e),
         T_1=readings.T_1 - p.T_1_0,
-        v_p=u.v_p - p.v_0,
-        Q_H=u.Q_H - p.Q_H_0,
-        v_p_mean=memory.v_p_mean - p.v_0,
+        v_p=read.v_p - p.v_0,
+        Q_H=read.Q_H - p.Q_H_0,
+        v_p_mean=e.pull_scale * memory.v_p_mean + e.pull_offset - p.v_0,
     )
 
 
@@ -225,9 +225,9 @@ def true_state(slot: Any, measured: Any, t: Any) -> Any:
         T_1_ref=measured.T_1_ref,
         T_1_ref_1min=measured.T_1_ref_1min,
         T_1_ref_5min=measured.T_1_ref_5min,
-        v_p=measured.v_p,
-        Q_H=measured.Q_H,
-        v_p_mean=measured.v_p_mean,
+        v_p=slot.v_p - p.v_0,
+        Q_H=slot.Q_H - p.Q_H_0,
+        v_p_mean=slot.v_p_mean - p.v_0,
         dT_i=slot.dT_i,
         Q_d=slot.Q_d,
         ring_offset=bias_offset(t, slot.episode),

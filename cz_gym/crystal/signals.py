@@ -14,7 +14,7 @@ from cz_gym.body.signals import outside
 from cz_gym.jit import jittable
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.schedule import bias_offset, drift
-from cz_gym.process import DONE, HEATER_SCALE, PULL_SCALE, Relative, signals
+from cz_gym.process import DONE, HEATER_SCALE, PULL_SCALE, Relative, read_drives, signals
 from cz_gym.process import Channel as Channel
 from cz_gym.support.units import KILO, MINUTE, MM
 
@@ -92,7 +92,7 @@ class Measured(NamedTuple):
 @jittable
 def measure(x: Any, u: Any, nominal: Any, memory: Any, readings: Any, slot: Any, t: Any) -> Any:
     """:class:`Measured` of a slot at its sample's time t [s]."""
-    p, e, L = slot.puller, slot.episode, x.L
+    p, e, L, read = slot.puller, slot.episode, x.L, read_drives(u, slot)
     near, far = later(L, NEAR, p), later(L, FAR, p)
     now, shift = shape_at(L, p, e), drift(t, e) - p.T_1_0
     return Measured(
@@ -105,9 +105,9 @@ def measure(x: Any, u: Any, nominal: Any, memory: Any, readings: Any, slot: Any,
         T_1_ref_5mm=value(near, slot, recipe._T_1) + recipe_error(near, e) + shift,
         T_1_ref_25mm=value(far, slot, recipe._T_1) + recipe_error(far, e) + shift,
         T_1=readings.T_1 - p.T_1_0,
-        v_p=u.v_p - nominal.v_p,
-        Q_H=u.Q_H - nominal.Q_H,
-        v_p_mean=memory.v_p_mean,
+        v_p=read.v_p - nominal.v_p,
+        Q_H=read.Q_H - nominal.Q_H,
+        v_p_mean=e.pull_scale * memory.v_p_mean + (e.pull_scale - 1.0) * nominal.v_p + e.pull_offset,
         alpha_ref=np.arctan(now.slope),
         L=L,
         v_p_ref=nominal.v_p - p.v_0,
@@ -161,9 +161,9 @@ def true_state(slot: Any, measured: Any, t: Any) -> Any:
         r_ref_5mm=measured.r_ref_5mm,
         r_ref_25mm=measured.r_ref_25mm,
         T_1_ref=recipe_error(L, slot.episode) + drift(t, slot.episode),
-        v_p=measured.v_p,
-        Q_H=measured.Q_H,
-        v_p_mean=measured.v_p_mean,
+        v_p=slot.v_p - slot.v_p_nominal,
+        Q_H=slot.Q_H - slot.Q_H_nominal,
+        v_p_mean=slot.v_p_mean,
         alpha_ref=measured.alpha_ref,
         L=L,
         v_p_ref=measured.v_p_ref,

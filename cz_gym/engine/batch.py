@@ -107,7 +107,7 @@ class Batch:
             slots,
             slots.view(np.float64).reshape(num_envs, -1),
             np.zeros((num_envs, depth, process.lagged)),
-            np.zeros((num_envs, frames, 4)),
+            np.zeros((num_envs, frames, 6)),
         )
         self.memory.slots["over"] = 1
         self._lots = scenario_table(config.scenario, config.model)

@@ -20,7 +20,7 @@ from cz_gym.physics.numerics import along, clip
 from cz_gym.process import GROWS, LOST, Inputs, Process, Readings
 from cz_gym.spaces import CLIP, INTEGRAL_SCALE
 
-from .loop import LANES, advance, drive, sample_sensors
+from .loop import LANES, advance, drive, sample_drives, sample_sensors
 from .slots import model_of
 
 
@@ -94,6 +94,7 @@ def _begin(slot: Any, interval: Any, model: Any) -> None:
     slot.fast, slot.slow = first_fluctuation(e, slot.streams)
     slot.dT_i, slot.Q_d, slot.drift = fluctuation(e, slot.fast, slot.slow), 0.0, np.nan
     slot.integral, slot.Q_heats = 0.0, nominal.Q_H
+    slot.v_p_misread = slot.Q_H_misread = 0.0
     slot.k = slot.frames = slot.over = slot.point = 0
 
 
@@ -106,6 +107,7 @@ def _sample(memory: Any, i: Any, fresh: Any, fixed: Any, scales: Any, out: Any, 
     if fresh:
         camera, pyrometer = sample_noise(slot.episode, slot.streams)
         sample_sensors(slot, camera, pyrometer, memory.frames[i], t, seen)
+        sample_drives(slot, memory.frames[i], fixed.interval)
         process.draw_sensor_noise(slot)
     u, before = labelled(Inputs, slot), Inputs(slot.v_p_before, slot.Q_H_before)
     step_memory = labelled(process.StepMemory, slot)
@@ -245,6 +247,7 @@ def build_kernels(process: Process, meniscus: MeniscusModel) -> Kernels:
                 numbers[model.constants + number] = episode[number]
             _begin(slot, fixed.interval, model)
             memory.frames[i, :, 3] = slot.Q_H
+            memory.frames[i, :, 4], memory.frames[i, :, 5] = slot.v_p, slot.Q_H
             _sample_alone(memory, i, True, fixed, scales, out, model)
         return impossible
 

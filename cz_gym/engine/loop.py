@@ -11,7 +11,7 @@ from cz_gym.physics.numerics import clip, rk4
 from cz_gym.physics.schedule import bias_offset, drift, pyrometer_drift, ripple
 from cz_gym.process import GROWS, Inputs
 
-_EPS, _POWER = 1e-9, 3
+_EPS, _POWER, _DRIVES = 1e-9, 3, 4
 
 
 @jittable
@@ -84,6 +84,26 @@ def mean_power(slot: Any, frames: Any, start: Any, stop: Any, interval: Any) -> 
         slot.Q_heats = power + behind * (1.0 - done)
         t = end
     return energy / (stop - start)
+
+
+@jittable
+def _whole(value: Any, step: Any) -> Any:
+    """The value in whole steps; as it is where the step is zero."""
+    return step * np.rint(value / step) if step > 0.0 else value
+
+
+@jittable
+def sample_drives(slot: Any, frames: Any, interval: Any) -> None:
+    """Keep what resolution and delay change in the readings of the drives; scale and offset follow from the episode."""
+    e = slot.episode
+    if e.delay + e.pull_resolution + e.heater_resolution > 0.0:
+        depth, back = frames.shape[0], int(np.rint(e.delay / interval))
+        frames[slot.k % depth, _DRIVES], frames[slot.k % depth, _DRIVES + 1] = slot.v_p, slot.Q_H
+        then = (slot.k - back) % depth
+        pull = e.pull_scale * frames[then, _DRIVES] + e.pull_offset
+        power = e.heater_scale * frames[then, _DRIVES + 1] + e.heater_offset
+        slot.v_p_misread = _whole(pull, e.pull_resolution) - (e.pull_scale * slot.v_p + e.pull_offset)
+        slot.Q_H_misread = _whole(power, e.heater_resolution) - (e.heater_scale * slot.Q_H + e.heater_offset)
 
 
 # Camera and pyrometer of a slot: frames, latency, noise, drop-outs and freezes.

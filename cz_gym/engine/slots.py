@@ -95,7 +95,8 @@ def slot_type(process: Process) -> np.dtype[Any]:
     clipped: a sample can be written again from its slot. Then the 5 s grid point that ``dT_i`` belongs to with its two
     processes [standard deviations], the episode's random streams, as far as they are drawn from, the power that heats
     [W] where the heater is slow, the pyrometer's filter with the true temperature at the last sample [K], the nominal
-    drives [m/s, W] from which the last action was counted, and what the process adds: the fields of ``StepMemory`` and
+    drives [m/s, W] from which the last action was counted, what resolution and delay change in the readings of the
+    drives [m/s, W], and what the process adds: the fields of ``StepMemory`` and
     its table.
     """
     number, whole, table = np.float64, np.int64, process.table
@@ -116,7 +117,7 @@ def slot_type(process: Process) -> np.dtype[Any]:
             ("slow", number),
             ("streams", np.uint64, (len(Stream), WORDS)),
             *((name, number) for name in ("Q_heats", "T_filtered", "T_1_before")),
-            *((name, number) for name in ("v_p_nominal", "Q_H_nominal")),
+            *((name, number) for name in ("v_p_nominal", "Q_H_nominal", "v_p_misread", "Q_H_misread")),
             *((name, number) for name in process.StepMemory._fields),
             *([("table", number, table)] if table[0] else []),
         ],
@@ -225,8 +226,8 @@ class SlotMemory(NamedTuple):
     history: Any
     """Running sums of the remembered channels, circular in time, shape (n, depth, channels); depth 0: none."""
     frames: Any
-    """Time [s], ring [m] and meniscus height [m] of camera frames, and the power [W] set in each control interval: both
-    circular in time, shape (n, depth, 4)."""
+    """Time [s], ring [m] and meniscus height [m] of camera frames, the power [W] set in each control interval, and
+    pull speed [m/s] and power [W] at each sample: all circular in time, shape (n, depth, 6)."""
 
 
 class Out(NamedTuple):

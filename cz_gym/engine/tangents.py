@@ -398,6 +398,8 @@ class DifferentiableBatch:
             )
         if any(max(each.actuators.heater_dead_time) > 0.0 for each in config.scenario.scenarios):
             raise CzError("a heater with a dead time has no derivatives: heater_dead_time must be 0")
+        if any(each.readings.delay > 0.0 for each in config.scenario.scenarios):
+            raise CzError("readings of drives with a delay have no derivatives: readings.delay must be 0")
         self.config = config = replace(config, observation="measured")
         self._made_for = config.made_for
         self._batch = Batch(config, self.num_envs, threads)

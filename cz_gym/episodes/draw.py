@@ -106,6 +106,13 @@ class Episode(NamedTuple):
     heater_lag: float = 0.0
     heater_dead_time: float = 0.0
     pyrometer_filter: float = 0.0
+    pull_scale: float = 1.0
+    pull_offset: float = 0.0
+    pull_resolution: float = 0.0
+    heater_scale: float = 1.0
+    heater_offset: float = 0.0
+    heater_resolution: float = 0.0
+    delay: float = 0.0
 
 
 class Factors(NamedTuple):
@@ -269,6 +276,7 @@ def draw_episode(record: Any, streams: Any, freezes: Any) -> Any:
     sd_fast, sd_slow = between(record.interface.sd, at[0]), between(record.interface.sd, at[1])
     keep_fast, keep_slow = np.exp(-GRID / record.interface.tau_fast), np.exp(-GRID / record.interface.tau_slow)
     fault = _draw_faults(record.faults, streams[_FAULTS], freezes)
+    readings, reads = record.readings, _draw_readings(record.readings, streams[_FAULTS])
     r_c_start = record.pullers.start_radius_sd * normal(streams[_START])
     slow = _uniforms(streams[_START], 3)
     return Episode(
@@ -293,7 +301,23 @@ def draw_episode(record: Any, streams: Any, freezes: Any) -> Any:
         heater_lag=between(drives.heater_lag, slow[0]), heater_dead_time=between(drives.heater_dead_time, slow[1]),
         sd_fast=sd_fast, sd_slow=sd_slow, keep_fast=keep_fast, keep_slow=keep_slow,
         kick_fast=np.sqrt(1.0 - keep_fast**2), kick_slow=np.sqrt(1.0 - keep_slow**2),
+        pull_scale=reads[0], pull_offset=reads[1], pull_resolution=readings.pull_resolution,
+        heater_scale=reads[2], heater_offset=reads[3], heater_resolution=readings.heater_resolution,
+        delay=readings.delay,
     )  # fmt: skip
+
+
+@jittable
+def _draw_readings(readings: Any, s: Any) -> Any:
+    """Scale [-] and offset of the readings of pull speed [m/s] and heater power [W], after the faults' numbers."""
+    u = _uniforms(s, 4)
+    pull, heater = two_normals(s)
+    return (
+        between(readings.pull_scale, u[0]) + readings.scale_sd * pull,
+        between(readings.pull_offset, u[1]),
+        between(readings.heater_scale, u[2]) + readings.scale_sd * heater,
+        between(readings.heater_offset, u[3]),
+    )
 
 
 @jittable

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.physics.quantities import MACHINE, Quantity, Range
+from cz_gym.physics.quantities import MACHINE, MAX_DEAD_TIME, Quantity, Range
 from cz_gym.physics.schedule import DRAW_SPAN
 from cz_gym.support.errors import CzError
 
@@ -195,6 +195,28 @@ class Actuators:
     heater_dead_time: Range = machine("heater_dead_time", NONE, Variation.RANGE)
 
 
+_SCALE = "1", 0.5, 2.0
+
+
+@dataclass(frozen=True)
+class DriveReadings:
+    """Errors with which the applied drives are read: scale * what was applied a delay ago + offset, in whole steps.
+
+    The scale multiplies the absolute reading, before the nominal value is subtracted. Nothing errs by default.
+    """
+
+    pull_scale: Range = member(ONE, Variation.RANGE, _SCALE, "scale of the pull speed's reading", later=True)
+    pull_offset: Range = member(NONE, Variation.RANGE, ("mm/min", -5.0, 5.0), "offset of that reading", later=True)
+    pull_resolution: float = member(0.0, Variation.NEVER, ("mm/min", 0.0, 1.0), "step of that reading", later=True)
+    heater_scale: Range = member(ONE, Variation.RANGE, _SCALE, "scale of the heater power's reading", later=True)
+    heater_offset: Range = member(NONE, Variation.RANGE, ("kW", -50.0, 50.0), "offset of that reading", later=True)
+    heater_resolution: float = member(0.0, Variation.NEVER, ("kW", 0.0, 10.0), "step of that reading", later=True)
+    scale_sd: float = member(
+        0.0, Variation.NONZERO, ("%", 0.0, 20.0), "standard deviation of both scales, each on its own", later=True
+    )
+    delay: float = member(0.0, Variation.NEVER, ("s", 0.0, MAX_DEAD_TIME), "age of both readings", later=True)
+
+
 @dataclass(frozen=True)
 class Scenario:
     """A distribution of episodes, by family; frozen, comparable, hashed."""
@@ -208,6 +230,7 @@ class Scenario:
     sensor: Sensor = field(default_factory=Sensor)
     faults: Faults = field(default_factory=Faults)
     actuators: Actuators = field(default_factory=Actuators)
+    readings: DriveReadings = field(default_factory=DriveReadings)
     series: tuple[tuple[float, float], ...] = ()
     """Heat load on the melt [W] and fluctuation of the interface [K] on the 5 s grid, in place of drawn ones; the last
     values stay (:mod:`cz_gym.episodes.scenario`)."""

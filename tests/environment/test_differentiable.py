@@ -12,7 +12,7 @@ from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.engine.slots import model_of
 from cz_gym.engine.tangents import STATES, DifferentiableBatch, rk4_by, rows, smooth, work_shape
-from cz_gym.episodes.scenario import Actuators
+from cz_gym.episodes.scenario import Actuators, DriveReadings
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.physics.meniscus import HURLE, hurle_slope
 from cz_gym.physics.numerics import jacobian
@@ -214,6 +214,7 @@ def test_the_end_of_the_tail_has_derivatives():
 
 
 DEAD = replace(RANDOMIZED, actuators=Actuators(heater_dead_time=(0.0, 5.0)))
+LATE = replace(RANDOMIZED, readings=DriveReadings(delay=5.0))
 
 
 @pytest.mark.parametrize(
@@ -222,6 +223,7 @@ DEAD = replace(RANDOMIZED, actuators=Actuators(heater_dead_time=(0.0, 5.0)))
         (make_config(control_interval=10.0, **PLAIN), 2, "must be at most 5 s"),
         (make_config("all", control_interval=2.5, **PLAIN), 2, "latency of 5 s is longer"),
         (make_config(DEAD), 2, "a heater with a dead time has no derivatives"),
+        (make_config(LATE), 2, "readings of drives with a delay have no derivatives"),
         ("randomized", 2, "this needs a Config, not .randomized."),
         (make_config(**PLAIN), 0, "num_envs must be"),
         (make_config(**PLAIN), 2.0, "num_envs must be"),
