@@ -82,18 +82,18 @@ class Config:
     puller: PullerFile = DEFAULT
     """The machine; scenario, parameters and control interval follow from it in :func:`make_config`."""
     process: Process = field(default=BODY, repr=False)
-    """What is simulated."""
+    """The simulated process."""
     weights: Any = BODY.weights
     """Weights of the reward's terms (:class:`cz_gym.body.signals.Weights`)."""
 
     @property
     def ranges(self) -> tuple[float, float]:
-        """What an action of 1 moves pull speed [m/s] and heater power [W] by, and what both are observed in."""
+        """Change of pull speed [m/s] and heater power [W] by an action of 1; both are observed in these scales."""
         return self.parameters.v_0, self.heater_range
 
     @property
     def heater_range(self) -> float:
-        """What an action of 1 moves the heater power by [W]."""
+        """Change of the heater power by an action of 1 [W]."""
         return self.puller.power_range
 
     @property
@@ -118,9 +118,9 @@ class Config:
 
     @property
     def plant_hash(self) -> str:
-        """SHA-256 of the plant: its parameters, and what it computes at some points (16 hex digits).
+        """SHA-256 of the plant: its parameters, and its results at some points (16 hex digits).
 
-        Not of its code: an equation that is written otherwise, and says the same, is the same plant.
+        The hash covers numbers, not code: rewriting an equation does not change it.
         """
         given, apart = self.parameters._asdict(), self.process.apart
         numbers = (0.0 if name in apart else float(value) + 0.0 for name, value in given.items())
@@ -129,7 +129,7 @@ class Config:
 
     @property
     def reward_hash(self) -> str:
-        """SHA-256 of the reward: its weights, and what it computes at some points (16 hex digits)."""
+        """SHA-256 of the reward: its weights, and its results at some points (16 hex digits)."""
         process, numbers = self.process, list[float](self.weights)
         carried = process.update_memory(
             process.StepMemory(*[1.0] * len(process.StepMemory._fields)), Inputs(2.0, 3.0), Inputs(0.0, 0.0), 60.0
@@ -141,7 +141,7 @@ class Config:
 
     @property
     def made_for(self) -> TargetEnv:
-        """What controllers and agents of this environment are made for."""
+        """The environment as controllers and agents name the one that they were made for."""
         return TargetEnv(self.action, self.control_interval, self.plant_hash, self.puller.label)
 
     @property
@@ -198,12 +198,7 @@ def make_config(
         raise CzError(f"parameters are those of the puller {machine.name!r}: give one of both")
     drawn_from = adapt_scenario(machine, find_distribution(scenario))
     mix_of(model, drawn_from)
-    if not isinstance(observation, str) or observation not in (*OBSERVATIONS, CAMERA):
-        raise CzError(unknown_name_message("observation", observation, [*OBSERVATIONS, CAMERA]))
-    if action not in ACTIONS:
-        raise CzError(unknown_name_message("action", action, ACTIONS))
-    if camera is not None and observation != CAMERA:
-        raise CzError(f'a camera is of use with observation="camera" only, not with {observation!r}')
+    _check_modes(observation, action, camera)
     interval = positive("control_interval", machine.control_interval if control_interval is None else control_interval)
     shape = meniscus or HURLE
     if not isinstance(shape, MeniscusModel):
@@ -221,6 +216,16 @@ def make_config(
         process=process,
         weights=process.weights if weights is None else _weights(weights, process.weights),
     )
+
+
+def _check_modes(observation: Any, action: Any, camera: Camera | None) -> None:
+    """Raise CzError for an observation or an action mode that is none, and for a camera that nothing observes."""
+    if not isinstance(observation, str) or observation not in (*OBSERVATIONS, CAMERA):
+        raise CzError(unknown_name_message("observation", observation, [*OBSERVATIONS, CAMERA]))
+    if action not in ACTIONS:
+        raise CzError(unknown_name_message("action", action, ACTIONS))
+    if camera is not None and observation != CAMERA:
+        raise CzError(f'a camera is of use with observation="camera" only, not with {observation!r}')
 
 
 def _weights(given: Any, usual: Any) -> Any:
@@ -245,7 +250,7 @@ def _hash(*numbers: float) -> str:
 
 @lru_cache(maxsize=64)
 def _computed(process: Process, meniscus: MeniscusModel, parameters: Parameters) -> tuple[float, ...]:
-    """What a process computes on a meniscus: constants of a puller, and rates, ring and hidden load at its points."""
+    """Numbers that a process computes on a meniscus: constants of a puller; rates, ring, hidden load at its points."""
     numbers = list[float]()
     with np.errstate(all="ignore"):
         for lam in (0.0, 0.4, 1.0):

@@ -116,7 +116,7 @@ def cache_folder() -> Path | None:
 
 
 def hashed(*functions: Callable[..., Any]) -> bool:
-    """Whether :func:`source_hash` sees the text of every one of these functions."""
+    """True if :func:`source_hash` counts the text of every one of these functions."""
     seen = {str(file) for file in compiled_sources()}
     codes = [getattr(function, "__code__", None) for function in functions]
     return all(code is not None and str(Path(code.co_filename)) in seen for code in codes)
@@ -181,7 +181,7 @@ def announce() -> None:
 
 F = TypeVar("F", bound=Callable[..., Any])
 UNCOMPILED = bool(cast(Any, numba.config).DISABLE_JIT)
-"""Whether the user has turned numba off by NUMBA_DISABLE_JIT: loops are then run by Python, a thousand times slower."""
+"""True if NUMBA_DISABLE_JIT turns numba off: Python then runs the loops, a thousand times slower."""
 
 
 def jittable(function: F) -> F:
@@ -278,7 +278,7 @@ def _compiled_fetch(array: Any, at: Any) -> Any:
 
 @cache
 def _symbol(value: Any) -> str:
-    """A name of a static value's functions for symbols: stable for those of this package, else used once.
+    """Hash of the names of a static value's functions, for symbols: stable for those of this package, else used once.
 
     Machine code of two values that is loaded from disk into one process must not have symbols in common: the linker
     would take one for the other.
@@ -304,7 +304,7 @@ class Static(types.Opaque):
 
     @property
     def key(self) -> Any:
-        """What tells two of these types apart."""
+        """The value, which tells two of these types apart."""
         return self.value
 
 

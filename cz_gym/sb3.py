@@ -143,7 +143,7 @@ class CzVecEnv(VecEnv):
         return [getattr(slot, method_name)(*method_args, **method_kwargs) for slot in self._at(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Whether the slots do what a wrapper does: each reports its episodes as ``Monitor`` does."""
+        """True for ``Monitor``: each slot reports its episodes as that wrapper does."""
         return [wrapper_class is Monitor for _ in self._at(indices)]
 
     def _at(self, indices: Any) -> "list[Slot]":
@@ -222,7 +222,7 @@ class ActionRepeat(VecEnvWrapper):
 
 
 def environment_steps(model: BaseAlgorithm) -> int:
-    """Environment steps that a model has learned for, with those of repeated actions."""
+    """Training steps of a model [environment steps]; each repeat of an action counts."""
     env = model.get_env()
     repeat = None if env is None else unwrap_vec_wrapper(env, ActionRepeat)
     return int(model.num_timesteps) * (1 if repeat is None else repeat.times)

@@ -1,4 +1,10 @@
-"""Actions: how they move the drives, and tagged ones that every environment but their own refuses."""
+"""Actions and observations: spaces, the effect of actions on the drives, channels and their decoding.
+
+A tagged action is refused by every environment but the one it was made for. An observed value is ``quantity / scale``
+clipped to +-10, float32; :mod:`cz_gym.body.signals` has quantities and scales. "history" adds the past as differences
+of the means of neighbouring time spans. These differ by micrometres, readings by millimetres, so the differences have
+scales of their own.
+"""
 
 import math
 from functools import cache
@@ -30,7 +36,7 @@ SMOOTH_PULL, SMOOTH_HEATER = 1.0, 0.5
 
 
 class Drives(NamedTuple):
-    """How an action moves the drives, in shares of v_0 and of the heater's range: keep * applied + gain * action."""
+    """Effect of an action on the drives, in shares of v_0 and of the heater's range: keep * applied + gain * action."""
 
     keep: float
     """Share of the present deviation that is left after one step [-]."""
@@ -111,7 +117,7 @@ class TargetEnv(NamedTuple):
 
 
 class TaggedAction(np.ndarray[Any, np.dtype[Any]]):
-    """An action, or one a row, that carries what it was made for; whatever is computed from it is a plain array."""
+    """An action, or one a row, that names the environment it was made for; arrays computed from it are plain ones."""
 
     made_for: TargetEnv | None
 
@@ -123,7 +129,7 @@ class TaggedAction(np.ndarray[Any, np.dtype[Any]]):
 
 
 def tag(action: npt.NDArray[Any], made_for: TargetEnv | None) -> npt.NDArray[Any]:
-    """The same action, refused by every environment but the one it was made for; with None, taken by every one."""
+    """Tag an action: every environment but the one it was made for refuses it; with None, every one takes it."""
     if made_for is None:
         return action
     tagged = action.view(TaggedAction)
@@ -146,12 +152,6 @@ def mismatch(made_for: TargetEnv | None, own: TargetEnv) -> str:
         "gym.make(..., **controller.settings) makes the one that it was made for"
     )
 
-
-# Observations of ``Cz-v0``: scaled and clipped signals, and their decoding.
-#
-# An observed value is ``quantity / scale`` clipped to +-10, float32; :mod:`cz_gym.body.signals` has quantities and
-# scales. "history" adds the past as differences of the means of neighbouring time spans. These differ by micrometres,
-# readings by millimetres, so the differences have scales of their own.
 
 CLIP = 10.0
 """Largest observed value after scaling [-]."""
@@ -201,7 +201,7 @@ def lags(control_interval: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[np
 
 
 DRIVE_CHANNELS = tuple(Measured._fields.index(name) for name in ("v_p", "Q_H"))
-"""Where "measured" and "history" hold the applied drives, in units of the action."""
+"""Places in "measured" and "history" of the applied drives, which have units of the action."""
 LAGGED = tuple(each.name for each in BODY.past)
 """Signals whose past "history" shows."""
 OBSERVATIONS = observations(BODY)

@@ -1,4 +1,11 @@
-"""A scenario as one record for the compiled draws, and the constants of a drawn episode."""
+"""The draw of an episode: a value made at reset from one 128-bit key, and the random numbers that follow from it.
+
+A scenario is a record for the compiled draws. Each kind of random number has a stream of its own, seeded with its own
+number (:func:`stream_number`), so families never share one. Scalars come first on each stream, the noise of each step
+after them in order of time: a longer horizon extends a draw and never changes it, whether it is drawn step by step, as
+the environment does, or as whole series (:func:`episode_from_key`). Ramps are kept as parameters and evaluated where
+needed (:mod:`cz_gym.physics.schedule`).
+"""
 
 import math
 from enum import IntEnum
@@ -164,11 +171,7 @@ def scenario_table(distribution: Distribution, model: str | float | None = None)
     return table
 
 
-# The draw of an episode, compiled: streams from one key, then the puller, ramps, constants and freezes.
-#
-# Each stream is seeded with its own number (:func:`.record.stream_number`), so that families never share a random
-# number. Scalars come first on each stream, and the noise of each step after them (:mod:`cz_gym.episodes.draw`), so a
-# longer horizon extends a draw and never changes it.
+# Compiled: streams from one key, then the puller, ramps, constants and freezes.
 
 STREAMS = len(Stream)
 _NUMBERS = tuple(map(stream_number, range(STREAMS)))
@@ -368,63 +371,53 @@ def _place_freezes(lengths: Any, order: Any, share: Any, freezes: Any) -> None:
             freezes[which, 1] = start + lengths[which]
 
 
-# The random numbers of every step: interface fluctuation, sensor noise, drop-outs and outliers.
-#
-# ``streams`` are the episode's (:mod:`cz_gym.episodes.rng`), ``e`` its :class:`cz_gym.episodes.draw.Episode`. Each
-# kind is drawn in order of time from a stream of its own, so it depends on the episode's key alone, whether drawn step
-# by step or as a whole series.
+# Compiled: the random numbers of every step, from the streams of an :class:`Episode`.
 
 _DROPOUTS, _OUTLIERS = int(Stream.DROPOUTS), int(Stream.OUTLIERS)
 
 
 @jittable
-def first_fluctuation(e: Any, streams: Any) -> Any:
+def first_fluctuation(episode: Any, streams: Any) -> Any:
     """The interface's two stationary processes at t = 0 [standard deviations]."""
-    return two_normals(streams[_INTERFACE]) if e.sd_fast > 0.0 or e.sd_slow > 0.0 else (0.0, 0.0)
+    return two_normals(streams[_INTERFACE]) if episode.sd_fast > 0.0 or episode.sd_slow > 0.0 else (0.0, 0.0)
 
 
 @jittable
-def next_fluctuation(e: Any, streams: Any, fast: Any, slow: Any) -> Any:
+def next_fluctuation(episode: Any, streams: Any, fast: Any, slow: Any) -> Any:
     """The two processes at the next grid point, discretised exactly: x <- keep x + sqrt(1 - keep^2) n."""
-    first, second = two_normals(streams[_INTERFACE]) if e.sd_fast > 0.0 or e.sd_slow > 0.0 else (0.0, 0.0)
-    return e.keep_fast * fast + e.kick_fast * first, e.keep_slow * slow + e.kick_slow * second
+    first, second = two_normals(streams[_INTERFACE]) if episode.sd_fast > 0.0 or episode.sd_slow > 0.0 else (0.0, 0.0)
+    return episode.keep_fast * fast + episode.kick_fast * first, episode.keep_slow * slow + episode.kick_slow * second
 
 
 @jittable
-def fluctuation(e: Any, fast: Any, slow: Any) -> Any:
+def fluctuation(episode: Any, fast: Any, slow: Any) -> Any:
     """dT_i [K] of the two processes."""
-    return e.sd_fast * fast + e.sd_slow * slow
+    return episode.sd_fast * fast + episode.sd_slow * slow
 
 
 @jittable
-def sample_noise(e: Any, streams: Any) -> Any:
+def sample_noise(episode: Any, streams: Any) -> Any:
     """Camera [m] and pyrometer [K] noise of the next sample; a camera's NaN is a drop-out."""
-    noisy = e.camera_sd > 0.0 or e.pyrometer_sd > 0.0
+    noisy = episode.camera_sd > 0.0 or episode.pyrometer_sd > 0.0
     camera, pyrometer = two_normals(streams[_SENSOR]) if noisy else (0.0, 0.0)
-    camera, pyrometer = e.camera_sd * camera, e.pyrometer_sd * pyrometer
-    if e.outlier_probability > 0.0 and uniform(streams[_OUTLIERS]) < e.outlier_probability:
-        camera += e.outlier_sd * normal(streams[_OUTLIERS])
-    if e.dropout > 0.0 and uniform(streams[_DROPOUTS]) < e.dropout:
+    camera, pyrometer = episode.camera_sd * camera, episode.pyrometer_sd * pyrometer
+    if episode.outlier_probability > 0.0 and uniform(streams[_OUTLIERS]) < episode.outlier_probability:
+        camera += episode.outlier_sd * normal(streams[_OUTLIERS])
+    if episode.dropout > 0.0 and uniform(streams[_DROPOUTS]) < episode.dropout:
         camera = np.nan
     return camera, pyrometer
 
 
 @jittable
-def draw_series(e: Any, streams: Any, interface: Any, noise: Any) -> None:
+def draw_series(episode: Any, streams: Any, interface: Any, noise: Any) -> None:
     """Write dT_i [K] on the grid, shape (points,), and the noise of each sample, shape (samples, 2)."""
-    fast, slow = first_fluctuation(e, streams)
+    fast, slow = first_fluctuation(episode, streams)
     for j in range(interface.size):
-        interface[j] = fluctuation(e, fast, slow)
-        fast, slow = next_fluctuation(e, streams, fast, slow)
+        interface[j] = fluctuation(episode, fast, slow)
+        fast, slow = next_fluctuation(episode, streams, fast, slow)
     for k in range(noise.shape[0]):
-        noise[k, 0], noise[k, 1] = sample_noise(e, streams)
+        noise[k, 0], noise[k, 1] = sample_noise(episode, streams)
 
-
-# An episode's draw: a value made at reset from one 128-bit key, and the series that follow from it.
-#
-# Ramps are kept as parameters and evaluated where needed (:mod:`cz_gym.physics.schedule`). The noise of each step
-# comes from the episode's own streams (:mod:`cz_gym.episodes.draw`): the environment draws it step by step, this
-# module as whole series.
 
 Floats = npt.NDArray[np.float64]
 
@@ -466,6 +459,6 @@ def _factors(record: Any, mix: Any, key: Any) -> Any:
 def _episode(record: Any, key: Any, interface: Any, noise: Any, freezes: Any) -> Any:
     streams = np.zeros((STREAMS, WORDS), np.uint64)
     seed_streams(streams, key)
-    e = draw_episode(record[0], streams, freezes)
-    draw_series(e, streams, interface, noise)
-    return e
+    episode = draw_episode(record[0], streams, freezes)
+    draw_series(episode, streams, interface, noise)
+    return episode

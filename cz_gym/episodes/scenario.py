@@ -40,19 +40,19 @@ _SPREAD = "%", 0.0, 49.9
 
 
 class Variation(Enum):
-    """When a member of a scenario makes its episodes differ from each other."""
+    """Condition under which a member of a scenario makes its episodes differ from each other."""
 
     NEVER = "never"
-    """It is a constant, or matters only beside another member."""
+    """Never: a constant, or a number that matters only beside another member."""
     RANGE = "range"
-    """Where the ends of its range differ: the value is drawn between them."""
+    """If the ends of its range differ: the value is drawn between them."""
     NONZERO = "nonzero"
-    """Wherever it is not zero: the size or the number of something random."""
+    """If it is not zero: the size or the number of something random."""
     CHANCE = "chance"
-    """Between 0 and 1: the probability that something happens."""
+    """If it lies between 0 and 1: the probability that something happens."""
 
     def differs(self, value: Any) -> bool:
-        """Whether a member of this kind and value makes episodes differ."""
+        """True if a member of this kind and value makes episodes differ."""
         if self is Variation.RANGE:
             return bool(value[0] != value[1])
         if self is Variation.CHANCE:
@@ -281,7 +281,7 @@ class Scenario:
 
     @property
     def deterministic(self) -> bool:
-        """Whether all its episodes are the same: no member makes them differ (:class:`Variation`)."""
+        """True if no member makes episodes differ (:class:`Variation`): all are the same."""
         return not any(each.metadata["member"].draw.differs(value) for _, each, value in self.members)
 
 
@@ -309,7 +309,7 @@ def _check(where: str, each: dataclasses.Field[Any], value: Any) -> None:
 
 
 def _is_number(part: Any, default: Any) -> bool:
-    """Whether a number is of the default's kind: whole, finite, or infinite where the default is."""
+    """True for a number of the default's kind: whole, finite, or infinite where the default is."""
     if isinstance(part, bool) or not isinstance(part, int if isinstance(default, int) else int | float):
         return False
     return math.isfinite(part) or (math.isinf(default) and part == math.inf)
@@ -336,7 +336,7 @@ class Mixture:
     scenarios: tuple[Scenario, ...]
     """The scenarios, ordered by name."""
     shares: tuple[float, ...]
-    """Each scenario's share of the episodes [-]; the sum is 1."""
+    """Share of the episodes of each scenario [-]; the sum is 1."""
 
     @property
     def name(self) -> str:
@@ -351,12 +351,12 @@ class Mixture:
 
     @property
     def deterministic(self) -> bool:
-        """Whether all its episodes are the same."""
+        """True if all episodes are the same."""
         return len(self.scenarios) == 1 and self.scenarios[0].deterministic
 
 
 Distribution = Scenario | Mixture
-"""What episodes are drawn from."""
+"""A scenario, or a mixture of several, from which episodes are drawn."""
 AnyScenario = str | Path | Scenario | Mixture | Mapping[Any, float]
 """The environment's ``scenario`` argument: a name, a scenario, scenarios or names with their shares, or a CSV file of
 disturbances from logs."""

@@ -244,7 +244,7 @@ def adapt_scenario(puller: PullerFile, distribution: Distribution) -> Distributi
 
 
 def _proportion(puller: PullerFile, unit: str) -> float:
-    """What a scenario's number of this SI unit is multiplied by [-]."""
+    """Factor on a scenario's number of this SI unit [-]."""
     if unit in ("W", "W/s"):
         return puller.power_range / DEFAULT.power_range
     speed = puller.parameters.v_0 / DEFAULT.parameters.v_0
@@ -252,7 +252,7 @@ def _proportion(puller: PullerFile, unit: str) -> float:
 
 
 def _stated(puller: PullerFile, quantity: Quantity) -> Any:
-    """What the puller's file says of a scenario's number [SI units]; None: nothing."""
+    """Value of a scenario's number in the puller's file [SI units]; None: the file has none."""
     if quantity.symbol == "pull_window":
         return puller.pull_room if math.isfinite(puller.pull_room) else None
     return value_of(puller, quantity) if quantity.symbol else None

@@ -47,7 +47,7 @@ class Parameters(NamedTuple):
 
 
 class CrystalRecipe(NamedTuple):
-    """What a puller grows: charge, shape and growth rate of a whole crystal, and how the crystal gives off its heat.
+    """A whole crystal that a puller grows: charge, shape, growth rate, and the crystal's loss of heat.
 
     SI units; the numbers of the table ``[recipe]`` of a puller file. Only ``CzCrystal-v0`` reads them.
     """

@@ -21,7 +21,7 @@ SIZES: dict[str, dict[str, float]] = {
     "N/m": {"mN/m": 1e-3}, "kg": {"g": 1e-3}, "kg/m3": {"g/cm3": KILO}, "J/kg": {"kJ/kg": KILO}, "J/K": {"kJ/K": KILO},
     "W/K": {"kW/K": KILO}, "W/m/K": {"W/cm/K": 100.0}, "W/K4": {}, "W/m2/K4": {},
 }  # fmt: skip
-"""Each SI unit, with the units that users may state or mean instead, and their sizes in it."""
+"""SI units, each with the units that users may state or mean instead, and their sizes in it."""
 _SI = {name: si for si, sizes in SIZES.items() for name in (si, *sizes)}
 _ZEROS = {"°C": CELSIUS}
 _ROUNDING = 1e-12
@@ -46,9 +46,9 @@ class Quantity(NamedTuple):
     usual: tuple[float, float] = (-math.inf, math.inf)
     """Range outside of which it is possible but improbable [shown unit]."""
     drawn: bool = False
-    """Whether each crystal may draw its own from a range."""
+    """True if each crystal may draw its own from a range."""
     later: bool = False
-    """Whether it was added after hashes were published: at its default it is left out of them."""
+    """True if it was added after hashes were published: they leave it out at its default."""
     table: str = ""
     """Its table in a puller file; empty if it has none."""
     symbol: str = ""
@@ -72,7 +72,7 @@ class Quantity(NamedTuple):
         return f"{self.stem or self.symbol}_{ending}".removesuffix("_")
 
     def holds(self, value: float, usual: bool = False) -> bool:
-        """Whether a value [SI unit] is plausible, or even usual."""
+        """True if a value [SI unit] is plausible, or even usual."""
         low, high = (end * self.size for end in (self.usual if usual else (self.low or 0.0, self.high)))
         return low - _ROUNDING * abs(low) <= value <= high + _ROUNDING * abs(high)
 

@@ -1,1 +1,1 @@
-"""The machine: puller files, identification from logs, export to a controller, the virtual puller."""
+"""The machine's numbers: puller files, and the pullers that ship."""

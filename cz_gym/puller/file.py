@@ -1,7 +1,8 @@
-"""The text of a puller file: TOML, with the unit in every key, from and to numbers in SI units.
+"""A puller as a file: TOML with the unit in every key, from and to numbers in SI units.
 
-A number is read exactly (decimal text times the unit's size, rounded once), and written with the fewest digits that
-read back the same.
+Keys are those of :data:`cz_gym.physics.quantities.MACHINE`, from which reader, writer, errors and the page's table
+follow. A number is read exactly (decimal text times the unit's size, rounded once), and written with the fewest digits
+that read back the same.
 """
 
 import hashlib
@@ -40,7 +41,7 @@ OPTIONAL = "recipe"
 
 
 def read_numbers(text: str) -> tuple[Any, dict[str, Any], tuple[str, ...]]:
-    """The name in a file's text (None: it has none), its numbers by symbol, and the keys that it does not have."""
+    """Read the name in a file's text (None: there is none), its numbers by symbol, and the keys that it lacks."""
     try:
         content = tomllib.loads(text, parse_float=Decimal)
     except tomllib.TOMLDecodeError as error:
@@ -67,7 +68,7 @@ def read_numbers(text: str) -> tuple[Any, dict[str, Any], tuple[str, ...]]:
 
 
 def write_numbers(name: str, numbers: Mapping[str, Any]) -> str:
-    """The text of a file with these numbers, by symbol [SI units]; one that is None is left out."""
+    """Text of a file with these numbers, by symbol [SI units]; one that is None is left out."""
     lines = [f"format = {FORMAT}", f"name = {json.dumps(name, ensure_ascii=False)}"]
     for table, known in TABLES.items():
         lines += ["", f"[{table}]"]
@@ -112,11 +113,6 @@ def _shortest(value: float, quantity: Quantity) -> str:
     plain = text.normalize(Context(prec=40))
     return f"{plain:f}" if -5 < plain.adjusted() < 7 else f"{plain:E}"
 
-
-# A puller as a file: its numbers in TOML, with the unit in every key.
-#
-# Keys are those of :data:`cz_gym.physics.quantities.MACHINE`, from which reader, writer, errors and the page's table
-# follow.
 
 FOLDER = Path(__file__).parent / "shipped"
 """Folder of the files that ship."""
@@ -216,7 +212,7 @@ class PullerFile:
 
     @cached_property
     def power_range(self) -> float:
-        """What an action of 1 moves the heater by: its range, or what is left to its largest power [W]."""
+        """Change of the heater's power by an action of 1: its range, or the rest up to its largest power [W]."""
         room = math.inf if self.heater_max is None else self.heater_max - make_puller(self.parameters).Q_H_0
         return min(self.heater_range, room)
 
@@ -270,7 +266,7 @@ def write_puller(puller: PullerFile, path: str | Path) -> None:
 
 
 def find_puller(given: str | Path | PullerFile | None) -> PullerFile:
-    """The puller that is meant by a file, a file's text, a shipped name, or itself; None is the default one."""
+    """Find the puller of a file, a file's text or a shipped name; a puller is itself, None the default one."""
     if given is None or isinstance(given, PullerFile):
         return given or DEFAULT
     if not isinstance(given, str | Path):
@@ -297,13 +293,13 @@ def chosen_puller(given: str | None) -> PullerFile:
 
 
 def defaults_of(puller: PullerFile) -> dict[str, Any]:
-    """What a puller's file lacks and the default puller has, by key [SI units]; the rest is the scenario's own."""
+    """Values of the default puller for keys that the puller's file lacks, by key [SI units]."""
     values = {each.key: value_of(DEFAULT, each) for each in MACHINE.values() if each.key in puller.missing}
     return {key: value for key, value in values.items() if value is not None}
 
 
 def doubts(puller: PullerFile) -> list[str]:
-    """What is possible in a puller but improbable, each in a line that says what may be meant."""
+    """Lines on numbers of a puller that are possible but improbable, each with what may be meant."""
     q, power, nominal = puller.parameters, puller.power_range, make_puller(puller.parameters).Q_H_0
     lines = []
     for each in MACHINE.values():
@@ -346,13 +342,18 @@ def _check(puller: PullerFile, quantity: Quantity) -> None:
     sound = all(isinstance(each, int | float) and not isinstance(each, bool) for each in numbers)
     if not sound or len(numbers) != 1 + drawn or not numbers[0] <= numbers[-1]:
         pair = ", or a pair [low, high] with low <= high" if drawn else ""
-        given = value if isinstance(value, tuple) else (value,)
-        texts = ", ".join(f"{each / quantity.size:g}" if isinstance(each, float) else str(each) for each in given)
-        raise CzError(f"{quantity.key} must be a number{pair}, not {f'[{texts}]' if given is value else texts:.60}")
+        raise CzError(f"{quantity.key} must be a number{pair}, not {_shown(value, quantity.size):.60}")
     for number in numbers:
         if not quantity.holds(number):
             limits = quantity.limits(number, quantity.shown)
             raise CzError(f"{quantity.key} = {number / quantity.size:g} must lie within {limits}")
+
+
+def _shown(value: Any, size: float) -> str:
+    """Text of a value, or of each of a list, in a unit of this size, as a file has it."""
+    listed = isinstance(value, tuple)
+    texts = [f"{each / size:g}" if isinstance(each, float) else str(each) for each in (value if listed else (value,))]
+    return f"[{', '.join(texts)}]" if listed else texts[0]
 
 
 DEFAULT = PullerFile()

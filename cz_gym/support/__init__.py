@@ -1,1 +1,1 @@
-"""What only serves the others: files, names, command lines, processors, plausible numbers, units."""
+"""Helpers of the other rooms: files, names, command lines, errors, units."""

@@ -1,4 +1,4 @@
-"""Command lines of the project: errors that are meant for the user, and interrupts, print one line."""
+"""Command lines of the project: an error that is meant for the user, or an interrupt, prints one line."""
 
 import argparse
 import os

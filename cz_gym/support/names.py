@@ -1,4 +1,4 @@
-"""Messages for a name that does not exist, and for a name given where an object is needed."""
+"""Messages for unknown names and wrong types; functions on nested tuples of arrays; versions of packages."""
 
 import inspect
 import platform
@@ -14,7 +14,7 @@ from .errors import CzError, UnexpectedKeyword
 
 
 def require_type(kind: type, value: Any, how: str) -> Any:
-    """Return the value; raise CzError with a hint on how to make one unless it is of this type."""
+    """Return the value; raise CzError, with a hint on how to make one, unless it is of this type."""
     if not isinstance(value, kind):
         name, given = kind.__name__, " ".join(repr(value).split())
         raise CzError(f"this needs {'an' if name[0] in 'AEIO' else 'a'} {name}, not {given:.80}: {how}")
@@ -22,7 +22,7 @@ def require_type(kind: type, value: Any, how: str) -> Any:
 
 
 def unknown_name_message(kind: str, name: object, known: Iterable[str], also: str = "") -> str:
-    """One line: the unknown name, the closest known one, all known ones, and what else (``also``) is accepted."""
+    """Line on an unknown name: the closest known one, all known ones, and what else (``also``) is accepted."""
     names = list(known)
     close = get_close_matches(name, names, 1, 0.65) if isinstance(name, str) else []
     meant = f": did you mean {close[0]!r}? Choose" if close else "; choose"
@@ -40,11 +40,8 @@ def check_keywords(given: Iterable[str], *functions: Callable[..., Any]) -> None
             )
 
 
-# Functions on nested tuples of arrays: the memories of controllers, and records of one kind.
-
-
 def map_arrays(function: Callable[..., Any], *values: Any) -> Any:
-    """The nested tuple of the function's results for the arrays of ``values``, which are nested alike."""
+    """Apply a function to the arrays of ``values``, which are nested alike; return its results nested as these."""
     if not isinstance(values[0], tuple):
         return function(*values)
     parts = [map_arrays(function, *some) for some in zip(*values, strict=True)]
@@ -52,7 +49,7 @@ def map_arrays(function: Callable[..., Any], *values: Any) -> Any:
 
 
 def leaves(value: Any, between: str = "_", name: str = "") -> dict[str, Any]:
-    """The arrays of nested tuples, in order, by the names of their fields, or places, with ``between`` them."""
+    """Return the arrays of nested tuples by the names of their fields, or places, with ``between`` them, in order."""
     if not isinstance(value, tuple):
         return {name: value}
     parts: dict[str, Any] = {}
@@ -62,12 +59,12 @@ def leaves(value: Any, between: str = "_", name: str = "") -> dict[str, Any]:
 
 
 def select(where: Any, one: Any, other: Any) -> Any:
-    """``one`` in the slots where ``where``, of shape (n,), is true, ``other`` elsewhere; nested tuples of arrays."""
+    """Take ``one`` in the slots where ``where``, shape (n,), is true, ``other`` elsewhere; nested tuples of arrays."""
     return map_arrays(lambda a, b: np.where(np.reshape(where, (-1, *(1,) * (np.ndim(b) - 1))), a, b), one, other)
 
 
 def stack(values: Sequence[Any]) -> Any:
-    """NamedTuples of one kind as one NamedTuple of arrays, with a new leading axis."""
+    """Stack NamedTuples of one kind into one NamedTuple of arrays, with a new leading axis."""
     return map_arrays(lambda *parts: np.stack(parts), *values)
 
 

@@ -1,16 +1,27 @@
+"""The scalar environment: arguments, actions, info, mixtures of scenarios; tagged actions in every form."""
+
 import math
+import pickle
+from copy import deepcopy
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.error import InvalidAction, ResetNeeded
 
 import cz_gym
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv, Parameters, Scenario, make_puller
+from cz_gym.body.signals import Logged
 from cz_gym.config import Config, make_config
+from cz_gym.engine.batch import first_key
+from cz_gym.engine.tangents import DifferentiableBatch
+from cz_gym.episodes.draw import MIXTURE_STREAM
 from cz_gym.episodes.scenario import Actuators
+from cz_gym.episodes.scenarios import ALL, find_distribution
 from cz_gym.physics.plant import Disturbance, State, growth
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+from cz_gym.spaces import tag
 from tests.observed import PLAIN
 
 MM_PER_MIN = 1e-3 / 60
@@ -174,3 +185,179 @@ def test_drives_obey_window_slew_and_steps():
     np.testing.assert_allclose(power, 100 * np.rint(slewed / 100), atol=1e-6)
     back = [env.step(np.array([-1.0, 0.0], np.float32))[4] for _ in range(60)]
     assert min(info["v_p"] for info in back) == pytest.approx(p.v_0 - 0.5 * MM_PER_MIN)
+
+
+P = make_puller()
+
+
+@pytest.mark.parametrize("interval", [2.0, 5.0, 10.0])
+def test_a_held_action_is_approached_with_one_time_constant(interval):
+    """v_p -> v_0 (1 + a) and Q_H -> Q_H0 + 5 kW a, whatever the control interval."""
+    env = CzEnv("nominal", action="smooth", control_interval=interval, horizon=600.0, info="all")
+    env.reset(seed=0)
+    for k in range(round(100.0 / interval)):
+        *_, info = env.step(np.array([0.4, -0.5], np.float32))
+        reached = 1.0 - math.exp(-(k + 1) * interval / 50.0)
+        assert info["v_p"] / P.v_0 - 1.0 == pytest.approx(0.4 * reached, rel=1e-5)
+        assert info["Q_H"] - P.Q_H_0 == pytest.approx(5e3 * -0.5 * reached, rel=1e-5)
+    for _ in range(round(100.0 / interval)):
+        *_, info = env.step(np.zeros(2, np.float32))
+    assert info["v_p"] / P.v_0 - 1.0 == pytest.approx(0.4 * (math.exp(-2.0) - math.exp(-4.0)), rel=1e-5)
+
+
+@pytest.mark.parametrize("interval", [2.0, 10.0])
+def test_rates_add_up_within_the_range_of_the_drives(interval):
+    """An action of 1 moves the pull speed by v_0 and the heater by 5 kW every 50 s; left alone they stay."""
+    env = CzEnv("nominal", action="rate", control_interval=interval, horizon=600.0, info="all")
+    env.reset(seed=0)
+    steps = round(20.0 / interval)
+    for action, pull, power in (
+        (-0.5, -0.2, -1e3),
+        (0.0, -0.2, -1e3),
+        (-1.0, -0.6, -3e3),
+        (-1.0, -1.0, -5e3),
+        (-1.0, -1.0, -7e3),
+    ):
+        for _ in range(steps):
+            _, _, over, _, info = env.step(np.full(2, action, np.float32))
+        assert info["v_p"] / P.v_0 - 1.0 == pytest.approx(pull, abs=1e-5)
+        assert info["Q_H"] - P.Q_H_0 == pytest.approx(power, rel=1e-5)
+    assert not over
+
+
+def test_info_is_lean_unless_all_is_asked_for():
+    for env, keys in (
+        (CzEnv(), {"r_c", "r_ref", "cost"}),
+        (CzEnv(info="all"), {*Logged._fields, "state"}),
+        (CzEnv(info="all", observation="measured"), set(Logged._fields)),
+    ):
+        _, info = env.reset(seed=0)
+        assert set(info) == keys
+        *_, info = env.step(np.array([0.5, 0.5], np.float32))
+        assert set(info) == keys
+        *_, info = env.step(np.array([1.5, 0.5], np.float32))
+        assert set(info) == keys | {"action_clipped"}
+        assert info["action_clipped"]
+        assert {type(value) for value in info.values()} <= {np.float64, np.bool_, bool, np.ndarray}, (
+            "TorchRL reads dtypes"
+        )
+
+
+def test_a_deep_copy_of_info_shares_nothing():
+    for env in CzEnv(), CzEnv(observation="measured"), CzEnv(info="all"):
+        _, info = env.reset(seed=0)
+        info["of a wrapper"] = {"inside": [1.0]}
+        before, copy = deepcopy(dict(info)), deepcopy(info)
+        info["r_c"] = 0.0
+        info["of a wrapper"]["inside"].append(2.0)
+        if "state" in info:
+            info["state"][:] = 0.0
+        assert repr(copy) == repr(before)
+
+
+MIX = {"puller": 1.0, "randomized": 2.0, replace(SCENARIOS["hard"], name="mine"): 1.0}
+MEMBERS = find_distribution(MIX).scenarios
+BY_NAME = {scenario.name: scenario for scenario in MEMBERS}
+SHORT = {"horizon": 40.0, "observation": "history", "action": "smooth", "info": "all"}
+
+
+def test_all_is_every_random_row_of_the_benchmark():
+    shares = {each.name: share for each, share in zip(ALL.scenarios, ALL.shares, strict=True)}
+    assert shares == {"hard": 0.175, "hot-zone": 0.175, "puller": 0.175, "randomized": 0.3, "sensor-fault": 0.175}
+    assert find_distribution("all") is ALL
+    assert find_distribution({name: 2.0 * share for name, share in shares.items()}) == ALL
+
+
+def test_shares_order_and_unit_of_equal_mixtures_do_not_matter():
+    one, other = find_distribution({"hard": 1, "puller": 3}), find_distribution({"puller": 75.0, "hard": 25.0})
+    assert (one, one.hash, one.name) == (other, other.hash, "0.25 hard + 0.75 puller")
+    assert one.hash != find_distribution({"hard": 1, "puller": 2}).hash
+    assert find_distribution(one) is one
+    config = make_config(one)
+    assert (config.scenario, config.mix) == (one, (0.0, 1.0))
+    assert make_config({"hard": 1, "puller": 2}).hash != config.hash != make_config("hard").hash
+    assert not one.deterministic
+    assert find_distribution({"nominal": 1.0}).deterministic
+    assert make_config("hard").sole_scenario is SCENARIOS["hard"]
+    with pytest.raises(ValueError, match="one scenario, not the mixture"):
+        config.sole_scenario  # noqa: B018
+
+
+def test_shares_of_two_thousand_episodes_on_a_stream_of_their_own():
+    _, infos = CzVectorEnv(2000, "all").reset(seed=5)
+    names, upto = [each.name for each in ALL.scenarios], np.cumsum(ALL.shares)
+    for i in range(2000):
+        stream = np.random.SeedSequence(list(first_key(5 + i)), spawn_key=(MIXTURE_STREAM,))
+        u = np.random.Generator(np.random.PCG64(stream)).random()
+        assert infos["scenario"][i] == names[int(np.searchsorted(upto, u, side="right"))]
+    for name, share in zip(names, ALL.shares, strict=True):
+        assert np.mean(infos["scenario"] == name) == pytest.approx(share, abs=4 * math.sqrt(share / 2000))
+
+
+@pytest.mark.parametrize("model", [None, "I"])
+def test_an_episode_is_bit_for_bit_that_of_its_scenario_alone(model):
+    """Every re-drawn episode, too: the environments alone are reset with the same seed as often as the mixture was."""
+    env, alone = CzEnv(MIX, model, **SHORT), {name: CzEnv(one, model, **SHORT) for name, one in BY_NAME.items()}
+    met = set()
+    for episode in range(12):
+        seed = 7 if episode == 0 else None
+        expected = {name: each.reset(seed=seed) for name, each in alone.items()}
+        observation, info = env.reset(seed=seed)
+        name = info.pop("scenario")
+        met.add(name)
+        np.testing.assert_array_equal(observation, expected[name][0])
+        for action in np.random.default_rng(4).uniform(-1.1, 1.1, (8, 2)):
+            found, (seen, reward, *ends, told) = env.step(action), alone[name].step(action)
+            assert found[4].pop("scenario") == name
+            np.testing.assert_array_equal(found[0], seen)
+            np.testing.assert_array_equal(found[4].pop("state"), told.pop("state"))
+            assert (found[1], *found[2:]) == (reward, *ends, told)
+    assert met == set(BY_NAME)
+
+
+def test_an_option_draws_one_episode_from_a_scenario_or_a_mixture():
+    env, batch = gym.make("Cz-v0", scenario=MIX), gym.make_vec("Cz-v0", 2, "vector_entry_point", scenario=MIX)
+    assert env.reset(seed=1, options={"scenario": "sensor-fault"})[1]["scenario"] == "sensor-fault"
+    assert batch.reset(seed=1, options={"scenario": "nominal"})[1]["scenario"].tolist() == ["nominal"] * 2
+    assert env.reset()[1]["scenario"] in BY_NAME
+    plain, batch = CzEnv("hard"), CzVectorEnv(2, "hard")
+    assert "scenario" not in plain.reset(seed=1)[1]
+    assert plain.reset(options={"scenario": {"nominal": 1.0}})[1]["scenario"] == "nominal"
+    assert batch.reset(options={"scenario": {"nominal": 1.0}})[1]["scenario"].tolist() == ["nominal"] * 2
+    assert pickle.loads(pickle.dumps(plain)).step(np.zeros(2))[4]["scenario"] == "nominal"
+    assert plain.reset()[1]["scenario"] == "hard"
+
+
+OWN = make_config(horizon=600.0, **PLAIN)
+
+
+@pytest.fixture(params=["scalar", "vector", "differentiable"])
+def step(request):
+    """The step of one form of the environment, with an action of its shape."""
+    if request.param == "scalar":
+        env = CzEnv.from_config(OWN)
+        env.reset(seed=0)
+        return env.step, np.zeros(2)
+    many = CzVectorEnv.from_config(OWN, 2) if request.param == "vector" else DifferentiableBatch(OWN, 2)
+    many.reset(seed=0) if isinstance(many, CzVectorEnv) else many.reset([0, 1])
+    return many.step, np.zeros((2, 2))
+
+
+@pytest.mark.parametrize(
+    ("other", "named"),
+    [
+        ({"action": "smooth"}, "action='smooth'"),
+        ({"control_interval": 2.0}, "control_interval=2"),
+        ({"parameters": Parameters(v_0=3e-5)}, "plant [0-9a-f]{16}"),
+        ({"meniscus": YOUNG_LAPLACE}, "plant [0-9a-f]{16}"),
+    ],
+)
+def test_step_refuses_what_was_made_for_another_environment(step, other, named):
+    take, action = step
+    theirs = tag(action, make_config(horizon=600.0, **other).made_for)
+    with pytest.raises(InvalidAction, match=f"was made for .*{named}.*; the environment has .*gym.make"):
+        take(theirs)
+    take(np.asarray(theirs))
+    take(np.clip(2.0 * theirs, -1.0, 1.0))
+    take(tag(action, make_config("hard", **PLAIN).made_for))
+    take(tag(action, None))

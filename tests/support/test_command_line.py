@@ -152,6 +152,14 @@ def test_only_what_is_meant_for_the_user_is_one_line_and_a_bug_keeps_its_traceba
     assert capsys.readouterr().err == said
 
 
+def test_commands_draw_although_a_notebook_names_a_backend_that_is_missing():
+    code = (
+        "from cz_gym.support.command_line import run_command as run\ndef body():\n import matplotlib.figure\n return 7"
+    )
+    named = {**os.environ, "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
+    assert python("-W", "error", "-c", f"{code}\nprint(run_command('command', body, 'benchmark'))", env=named) == "7\n"
+
+
 def test_every_package_of_the_extras_is_known_as_optional():
     project = tomllib.loads(Path("pyproject.toml").read_text())["project"]
     building = {"beautifulsoup4", "ruff", "mypy", "build", "setuptools", "pytest", "pytest_xdist", "hypothesis"}

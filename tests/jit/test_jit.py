@@ -1,4 +1,4 @@
-"""Each test runs fresh processes on a copy of the package, so that sources can be changed."""
+"""Compiled code and its hash: the changed equation runs, in fresh processes, without a compiler, cache or home."""
 
 import os
 import shutil
@@ -6,21 +6,23 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from cz_gym import HURLE
+from cz_gym import HURLE, CzEnv, Parameters
 from cz_gym.body.process import BODY
+from cz_gym.config import make_config
 from cz_gym.engine.kernels import build_kernels
-from cz_gym.jit import CachedCode, Store, cache_folder, jittable, kernel, source_hash
+from cz_gym.jit import CachedCode, Store, cache_folder, hash_files, jittable, kernel, source_hash
 from cz_gym.physics.meniscus import hurle_height
 from tests.processes import ROOT, python
 
 FACTOR = """
 from cz_gym import SCENARIOS
-from cz_gym.episodes import series
+from cz_gym.episodes import draw
 from cz_gym.jit import cache_folder
-a = series.draw_factors(SCENARIOS["randomized"], (0.0, 1.0), (1, 2)).a
-print(cache_folder(), a, sum(series._factors.stats.cache_hits.values()), sep="|")
+a = draw.factors_from_key(SCENARIOS["randomized"], (0.0, 1.0), (1, 2)).a
+print(cache_folder(), a, sum(draw._factors.stats.cache_hits.values()), sep="|")
 """
 
 
@@ -32,11 +34,11 @@ def package(tmp_path):
     return tmp_path / "copy"
 
 
-def run(code, folder, cache):
-    """The output of a fresh process, split at bars."""
-    environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
-    environment["CZ_GYM_CACHE_DIR"] = str(cache)
-    return python("-W", "error", "-c", code, cwd=folder, env=environment).strip().split("|")
+def run(code, folder=ROOT, cache=None, **changed):
+    """The output of a fresh process, split at bars; ``changed`` variables of its environment are removed by None."""
+    changed = {"CZ_GYM_CACHE_DIR": cache and str(cache), "PYTHONPATH": str(folder), **changed}
+    environment = {name: value for name, value in {**os.environ, **changed}.items() if value is not None}
+    return python("-B", "-W", "error", "-c", code, cwd=folder, env=environment).strip().split("|")
 
 
 @pytest.mark.slow
@@ -174,3 +176,73 @@ def test_code_of_two_menisci_that_two_processes_compiled_does_not_mix(tmp_path, 
     monkeypatch.setenv("CZ_GYM_CACHE_DIR", str(tmp_path))
     for names in (["hurle"], ["exact"], ["hurle", "exact"], ["exact", "hurle"]):
         python("-c", TWO_MENISCI, *names)
+
+
+def test_a_changed_equation_is_another_plant_and_the_same_said_otherwise_is_not(monkeypatch):
+    def with_rates(change):
+        return make_config(process=BODY._replace(rates=lambda *at: change(BODY.rates(*at)))).plant_hash
+
+    assert with_rates(lambda x: x) == make_config().plant_hash
+    assert with_rates(lambda x: x._replace(T_b=x.T_b * (1.0 + 1e-8))) != make_config().plant_hash
+    assert with_rates(lambda x: x._replace(T_b=x.T_b * (1.0 + 1e-14))) == make_config().plant_hash
+    assert make_config(parameters=Parameters(eps=0.201)).plant_hash != make_config().plant_hash
+
+
+def stretched(by):
+    """Hurle's meniscus, its height stretched."""
+
+    @jittable
+    def height(r_c, theta, a):
+        return by * HURLE.height(r_c, theta, a)
+
+    return HURLE._replace(name="stretched", height=height)
+
+
+def test_two_menisci_of_one_factory_are_two_plants():
+    hashes = {make_config(meniscus=stretched(by)).plant_hash for by in (1.0, 1.01, 1.02)}
+    assert len(hashes) == 3
+    assert make_config().plant_hash in hashes
+    assert make_config(meniscus=stretched(1.01)).plant_hash in hashes
+    assert make_config(meniscus=HURLE._replace(name="another name")).plant_hash == make_config().plant_hash
+
+
+def test_the_hash_of_files_counts_code_and_not_text(tmp_path):
+    module, hashes = tmp_path / "thing.py", []
+    for text in ('"""A."""\nx = 1\n"""B."""\n', '"""C."""\n# why\nx = (\n    1\n)\n', "x = 2\n"):
+        module.write_text(text)
+        hashes.append(hash_files([module]))
+    assert hashes[0] == hashes[1] != hashes[2]
+    assert hash_files([module]) != hash_files([module.rename(tmp_path / "other.py")])
+
+
+STEPS = """
+import gymnasium as gym, numpy as np, cz_gym
+one = gym.make("Cz-v0", scenario="puller", observation="measured")
+two = cz_gym.CzVectorEnv(2, scenario="puller", observation="measured")
+shown = one.reset(seed=1)[0], two.reset(seed=1)[0][0]
+for _ in range(3):
+    shown = one.step(np.zeros(2))[0], two.step(np.zeros((2, 2)))[0][0]
+assert (shown[0] == shown[1]).all()
+print(*shown[0])
+"""
+NOBODY = """
+import pwd
+def missing(user): raise KeyError(user)
+pwd.getpwuid = missing
+from cz_gym.jit import cache_folder
+print(cache_folder())
+"""
+
+
+def test_the_environment_gives_the_same_numbers_without_a_compiler():
+    env = CzEnv(scenario="puller", observation="measured")
+    seen = env.reset(seed=1)[0]
+    for _ in range(3):
+        seen = env.step(np.zeros(2))[0]
+    printed = [float(word) for word in run(STEPS, NUMBA_DISABLE_JIT="1")[0].split()]
+    assert printed == pytest.approx(seen.tolist(), rel=1e-5, abs=1e-6)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="users as POSIX has them")
+def test_a_user_without_a_home_has_no_cache():
+    assert run(NOBODY, HOME=None, XDG_CACHE_HOME=None) == ["None"]
