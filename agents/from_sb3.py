@@ -20,7 +20,7 @@ from cz_gym.config import Config, check_config, make_config
 from cz_gym.env import CzEnv, CzVectorEnv
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.user_code import scenarios
-from cz_gym.spaces import observation_space, observations
+from cz_gym.spaces import observations
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.files import write_files
 from cz_gym.support.names import require_type
