@@ -341,11 +341,8 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._prepare(config, num_envs, threads, everything)
-        rows = config.process.info
-        self._clipped, self._names = (
-            rows.index("action_clipped"),
-            rows if everything else config.process.BriefInfo._fields,
-        )
+        rows, brief = config.process.info, config.process.BriefInfo._fields
+        self._clipped, self._names = rows.index("action_clipped"), rows if everything else brief
         self._rows = tuple(map(rows.index, self._names))
         self._masks = tuple(f"_{name}" for name in self._names)
         self._everybody: Mask = np.ones(num_envs, np.bool_)
