@@ -138,14 +138,14 @@ class RecurrentPolicy(BasePolicy):
         """The memory of n crystals that begin, shape (n, means + units)."""
         return torch.zeros(n, self.means + self.gru.hidden_size)
 
-    def remember(self, measured: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def update_means(self, measured: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Features, shape (n, features), and leaky means after a reading, shape (n, channels)."""
         means = memory[:, : self.means] * self.keep + measured @ self.gain
         return torch.cat([measured, means], dim=1) @ self.differences, means
 
     def forward(self, measured: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The action, shape (n, 2), unclipped, and the memory after a reading, shape (n, channels)."""
-        features, means = self.remember(measured, memory)
+        features, means = self.update_means(measured, memory)
         x = torch.clamp((features - self.mean) / self.std.clamp(*STD_RANGE), -FEATURE_LIMIT, FEATURE_LIMIT)
         h = self.gru(x, memory[:, self.means :])
         y = torch.cat([x, h], dim=1)
@@ -211,7 +211,7 @@ def leaky_means(interval: float, process: Process) -> tuple[npt.NDArray[Any], np
 
 # Analytic policy gradients (APG) with the interface of stable-baselines3's algorithms.
 #
-# The plant's step is differentiated exactly (:func:`.plant_step.advance`), so that torch's autograd gives the gradient
+# The plant's step is differentiated exactly (:func:`advance`), so that torch's autograd gives the gradient
 # of the cost by the policy's weights: back-propagation through time over windows of an episode, in place of a gradient
 # that is estimated from rewards. The method knows the plant's equations while it trains; the policy reads sensors
 # alone.
@@ -231,7 +231,7 @@ class APG(BaseAlgorithm):
     ``env`` says what is learned: a vector environment with ``observation="measured"``. Training steps a
     differentiable twin of it with as many slots; ``env`` itself is only asked for its settings. ``window`` is the
     number of steps that a gradient goes back through; each update takes ``window * num_envs`` environment steps.
-    The cost is :class:`.plant_step.StepCost`; a constant ``learning_rate`` falls linearly to 0.
+    The cost is :class:`StepCost`; a constant ``learning_rate`` falls linearly to 0.
     The other arguments are stable-baselines3's. Raises CzError for an environment that is not this package's, or reads
     another observation.
     """
@@ -299,8 +299,8 @@ class APG(BaseAlgorithm):
             watch.on_rollout_start()
             loss, memory, going = self._window(crystals, memory, watch)
             watch.on_rollout_end()
-            self._follow(loss)
-            lost, over = crystals.renew()
+            self._descend(loss)
+            lost, over = crystals.replace_finished()
             memory[over] = 0.0
             updates += 1
             self.logger.record("train/cost", loss.item())
@@ -324,7 +324,7 @@ class APG(BaseAlgorithm):
         for _ in range(self.window):
             if warm:
                 with torch.no_grad():
-                    seen.append(policy.remember(measured, memory)[0])
+                    seen.append(policy.update_means(measured, memory)[0])
             action, memory = policy(measured, memory)
             before = state
             state, measured, grows, target = advance(before, action, crystals.batch)
@@ -336,7 +336,7 @@ class APG(BaseAlgorithm):
             policy.observe_statistics(torch.cat(seen))
         return torch.stack(costs).mean(), memory.detach(), going
 
-    def _follow(self, loss: torch.Tensor) -> None:
+    def _descend(self, loss: torch.Tensor) -> None:
         """Take a step along the gradient, unless it is not finite."""
         self.policy.optimizer.zero_grad()
         torch.autograd.backward(loss)
@@ -373,7 +373,7 @@ class _Crystals:
         seeds = self._random.integers(len(TRAINING_SEEDS), size=len(slots)).tolist()
         self.state, self.measured = map(torch.from_numpy, self.batch.reset(seeds, slots))
 
-    def renew(self) -> tuple[int, list[int]]:
+    def replace_finished(self) -> tuple[int, list[int]]:
         """Draw new crystals for those that were lost or have grown to their end: how many were lost, and all slots."""
         lost = int(self.batch.lost.sum())
         self._left -= 1

@@ -81,7 +81,7 @@ class AsymmetricPolicy(Asymmetric, ActorCriticPolicy):
     def _build_mlp_extractor(self) -> None:
         self.share_features_extractor = False
         self.pi_features_extractor = self.features_extractor = StateEstimator(self.observation_space)
-        self.vf_features_extractor = StateSight(self.observation_space)
+        self.vf_features_extractor = StateFeatures(self.observation_space)
         self.mlp_extractor, critic = (
             MlpExtractor(each.features_dim, self.net_arch, self.activation_fn, self.device)
             for each in (self.pi_features_extractor, self.vf_features_extractor)
@@ -101,7 +101,7 @@ class AsymmetricSACPolicy(Asymmetric, SACPolicy):
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         """The critics, on the true state and its products."""
-        settings = self._update_features_extractor(self.critic_kwargs, StateSight(self.observation_space))
+        settings = self._update_features_extractor(self.critic_kwargs, StateFeatures(self.observation_space))
         return StateCritic(**settings).to(self.device)
 
 
@@ -161,7 +161,7 @@ class StateEstimator(BaseFeaturesExtractor):
         return huber_loss(self.estimate(seen * self.gains), state[:, self.layout.unknown] * self.state_gains)
 
 
-class StateSight(BaseFeaturesExtractor):
+class StateFeatures(BaseFeaturesExtractor):
     """Features of a critic: "history", the true state, and its products.
 
     With a linear plant and a quadratic cost the value is quadratic in the state.

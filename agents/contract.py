@@ -75,7 +75,7 @@ class Contract:
     """Name of the environment that it was trained in."""
 
 
-LATER = {"puller": DEFAULT.label, "environment": "Cz-v0"}
+ADDED_FIELDS = {"puller": DEFAULT.label, "environment": "Cz-v0"}
 """Fields that older files do not have, and what is true of those."""
 
 
@@ -108,7 +108,7 @@ def make_contract(onnx_bytes: bytes, **facts: Any) -> Contract:
     AgentFileError for a value that no contract may hold.
     """
     digest = hashlib.sha256(onnx_bytes).hexdigest()
-    known = {**LATER, **facts, "sha256": digest}
+    known = {**ADDED_FIELDS, **facts, "sha256": digest}
     known["observation_hash"] = observation_hash(facts["observation"], known["environment"])
     _check(known, "contract")
     return Contract(**known)
@@ -174,7 +174,7 @@ def _parse(path: Path) -> Contract:
         version = data.get("format_version")
         raise AgentFileError(f"{path}: format version {version!r:.80}, this release reads {FORMAT_VERSION}")
     wanted = {field.name for field in fields(Contract)}
-    given = {**LATER, **data}
+    given = {**ADDED_FIELDS, **data}
     del given["format"], given["format_version"]
     if set(given) != wanted:
         odd = sorted(set(given) ^ wanted)[0]

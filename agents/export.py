@@ -28,7 +28,7 @@ from .policy import OnnxPolicy
 OPSET, IR_VERSION = 17, 9
 
 
-class Deterministic(nn.Module):
+class DeterministicActor(nn.Module):
     """The deterministic action of a policy, clipped to [-1, 1], for observations as the environment gives them.
 
     A recurrent policy also takes its state, of length ``memory``, and returns the next one.
@@ -102,7 +102,7 @@ def to_onnx(policy: BasePolicy, channels: int, normalisation: VecNormalize | Non
     torch's older exporter: the newer one needs more packages and takes a second.
     """
     policy.set_training_mode(False)
-    module = Deterministic(policy, normalisation).eval()
+    module = DeterministicActor(policy, normalisation).eval()
     examples = [torch.zeros(2, channels), torch.zeros(2, module.memory)][: 2 if module.memory else 1]
     inputs, outputs = (list(names[: len(examples)]) for names in (INPUTS, OUTPUTS))
     rows = {name: {0: "n"} for name in (*inputs, *outputs)}

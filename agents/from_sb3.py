@@ -27,7 +27,7 @@ from cz_gym.support.names import require_type
 
 from .contract import AgentFileError, Contract, agent_files
 from .policy import OnnxPolicy
-from .validation import JUDGING, validate
+from .validation import JUDGING_SEEDS, validate
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -99,7 +99,7 @@ def save_agent(
     apart = disagreement(agent, model, normalisation, config)
     if not apart <= TOLERANCE:
         raise AgentFileError(f"{path}: the file would act otherwise than the model, by up to {apart:.2g}")
-    contract = validate(agent, config, JUDGING).put_into(agent.contract)
+    contract = validate(agent, config, JUDGING_SEEDS).put_into(agent.contract)
     write_files(agent_files(path, agent.content, contract))
     return contract
 
@@ -215,7 +215,7 @@ def _convert(given: argparse.Namespace) -> None:
         normalisation = _read(given.vecnormalize, "a VecNormalize", lambda path: VecNormalize.load(str(path), env))
     name = given.out.stem if given.name is None else given.name
     contract = save_agent(given.out, model, name, normalisation, config, given.seed)
-    said = f"mean RMSE {contract.validation_rmse_mm:.3f} mm on {len(JUDGING)} validation episodes"
+    said = f"mean RMSE {contract.validation_rmse_mm:.3f} mm on {len(JUDGING_SEEDS)} validation episodes"
     print(f"wrote {given.out}: {contract.algorithm} after {contract.training_steps:,} steps, {said}")
 
 

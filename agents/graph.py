@@ -33,7 +33,7 @@ class GraphError(CzError):
     """A graph that no agent may have; the message says why."""
 
 
-def checked(onnx_bytes: bytes, channels: int) -> tuple[bytes, int]:
+def check_graph(onnx_bytes: bytes, channels: int) -> tuple[bytes, int]:
     """The checked graph, rebuilt, and the length of its state (0: none). Raises GraphError, ImportError."""
     import onnx
     from google.protobuf.message import Error as ProtobufError

@@ -13,7 +13,7 @@ from cz_gym.spaces import ACTIONS, TargetEnv, observations, tag
 from cz_gym.support.errors import CzError
 
 from .contract import AgentFileError, Contract, observation_hash, read_agent
-from .graph import GraphError, checked
+from .graph import GraphError, check_graph
 
 Floats = npt.NDArray[np.float32]
 
@@ -24,7 +24,7 @@ class OnnxPolicy:
 
     contract: Contract
     session: Any = field(repr=False, compare=False)
-    remembers: int = 0
+    memory_length: int = 0
     """Length of its state; 0 if it has none."""
     content: bytes = field(default=b"", repr=False, compare=False)
     """The ONNX file, so that a policy pickles."""
@@ -117,10 +117,10 @@ class OnnxPolicy:
                 f'gym.make("{self.contract.environment}", **agent.settings) gives them'
             )
         rows = np.atleast_2d(array)
-        if not self.remembers:
+        if not self.memory_length:
             (action,) = self._run({"observation": rows})
             return (action[0] if array.ndim == 1 else action), state
-        before = np.zeros((len(rows), self.remembers), np.float32)
+        before = np.zeros((len(rows), self.memory_length), np.float32)
         if state is not None:
             before += np.reshape(state, before.shape)
         if episode_start is not None:
@@ -133,7 +133,7 @@ class OnnxPolicy:
             outputs: list[Floats] = self.session.run(None, inputs)
         except Exception:  # onnxruntime raises its own exception types, one for each way a graph can fail
             raise AgentFileError(f"agent {self.contract.sha256[:12]}: its graph cannot be run") from None
-        shapes = [(len(inputs["observation"]), width) for width in (2, self.remembers) if width]
+        shapes = [(len(inputs["observation"]), width) for width in (2, self.memory_length) if width]
         if [output.shape for output in outputs] != shapes or not all(np.isfinite(output).all() for output in outputs):
             raise AgentFileError(f"agent {self.contract.sha256[:12]}: its action is not two finite numbers")
         outputs[0] = tag(outputs[0], self.made_for)
@@ -145,7 +145,7 @@ def _session(path: str | Path, onnx_bytes: bytes, channels: int) -> tuple[Any, i
     try:
         import onnxruntime
 
-        clean, state = checked(onnx_bytes, channels)
+        clean, state = check_graph(onnx_bytes, channels)
     except ImportError:
         raise AgentFileError('running agents needs onnx and onnxruntime: pip install ".[benchmark]"') from None
     except GraphError as error:

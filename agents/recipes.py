@@ -1,7 +1,7 @@
 """Recipes: every hyperparameter of every learner. A kind of learner is a dataclass, a recipe one value of it.
 
 A new recipe needs a line in :data:`RECIPES`; a new kind needs a dataclass here and a case in
-:func:`.algorithms.make_algorithm`.
+:func:`make_algorithm`.
 """
 
 import inspect
@@ -27,7 +27,7 @@ from .asymmetric import AsymmetricPolicy, AsymmetricSACPolicy
 
 LEAST_ENVS, LEAST_BATCH = 8, 64
 """Least number of crystals at a time, and of samples in a batch, on a small budget."""
-CZ, CRYSTAL = ENVIRONMENTS
+BODY_ENV, CRYSTAL_ENV = ENVIRONMENTS
 FEW_UPDATES = 50
 """Number of updates below which nothing is learned."""
 
@@ -82,7 +82,7 @@ class TrainingConfig:
         interval, puller = (None, self.puller) if self.puller else (self.control_interval, None)
         return make_config(
             scenarios(self.scenario), None, self.observation, interval, action=self.action, puller=puller,
-            process=ENVIRONMENTS[self.environment or CZ], stage=dict.fromkeys(self.stages, 1.0) or None,
+            process=ENVIRONMENTS[self.environment or BODY_ENV], stage=dict.fromkeys(self.stages, 1.0) or None,
         )  # fmt: skip
 
 
@@ -201,7 +201,7 @@ PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64))
 RECIPES: dict[str, TrainingConfig] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG())}
 """Recipes by name: the choices of ``train.py --algo``."""
 _along: dict[str, Any] = {
-    "environment": CRYSTAL,
+    "environment": CRYSTAL_ENV,
     "stages": ("crown", "body", "tail"),
     "scenario": "randomized=0.5,hard=0.5",
 }
@@ -210,7 +210,7 @@ CRYSTAL_RECIPES: dict[str, TrainingConfig] = {
     "gradient": APG(name="gradient-along", num_envs=96, steps=17_280_000, **_along),
 }
 """Recipes of CzCrystal-v0: one agent for crown, body and tail."""
-DEFAULT = "ppo"
+DEFAULT_RECIPE = "ppo"
 """The recipe that train.py follows unless another is named."""
 
 
@@ -246,7 +246,7 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0) -> BaseAlgo
     if isinstance(recipe, Reinforcement):
         env = ActionRepeat(env, recipe.action_repeat)
         env = VecNormalize(env, norm_obs=False, gamma=recipe.gamma)
-        settings["learning_rate"] = partial(linear, recipe.learning_rate)
+        settings["learning_rate"] = partial(linear_schedule, recipe.learning_rate)
         options["net_arch"] = {"pi": list(recipe.hidden), critics: list(recipe.critic_hidden)}
     if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer
         settings["learning_starts"] += done // recipe.action_repeat
@@ -263,6 +263,6 @@ def repeat_of(recipe: TrainingConfig) -> int:
     return recipe.action_repeat if isinstance(recipe, Reinforcement) else 1
 
 
-def linear(start: float, left: float) -> float:
+def linear_schedule(start: float, left: float) -> float:
     """A learning rate that falls linearly with the share of training that is left, to a twentieth."""
     return start * (0.05 + 0.95 * left)

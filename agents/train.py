@@ -243,7 +243,7 @@ class TrainingRun:
         path, config = self.folder / "agent.onnx", self.recipe.config
         normalisation = self.algorithm.get_vec_normalize_env()
         agent = to_agent(self.algorithm, self.recipe.name, self.seed, config, normalisation, path)
-        figures = validation.validate(agent, config, validation.PICKING)
+        figures = validation.validate(agent, config, validation.SELECTION_SEEDS)
         if self.best_cost is None or figures.cost < self.best_cost:
             self.best_cost = figures.cost
             self._keep_agent(agent, figures)
@@ -270,9 +270,9 @@ class TrainingRun:
     def finish(self) -> dict[str, float]:
         """Test the best agent on episodes that did not choose it; returns the content of ``summary.json``."""
         agent = OnnxPolicy.load(self.folder / "agent.onnx", self.recipe.config)
-        figures = validation.validate(agent, self.recipe.config, validation.JUDGING)
+        figures = validation.validate(agent, self.recipe.config, validation.JUDGING_SEEDS)
         summary = {
-            "validation_episodes": len(validation.JUDGING),
+            "validation_episodes": len(validation.JUDGING_SEEDS),
             "validation_cost": figures.cost,
             "validation_rmse_mm": figures.rmse_mm,
             **{validation.reference_column(name): judged for name, (_, judged) in self.references.items()},

@@ -1,4 +1,4 @@
-"""Cost, radius error and losses of an agent on validation crystals."""
+"""Cost, radius error and losses of an agent on validation crystals, and their curves while it learns."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -20,15 +20,15 @@ from .contract import Contract
 from .recipes import TrainingConfig
 
 Floats = npt.NDArray[np.float64]
-PICKING = VALIDATION_SEEDS[:64]
+SELECTION_SEEDS = VALIDATION_SEEDS[:64]
 """Seeds of the crystals that choose the best agent of a run."""
-JUDGING = VALIDATION_SEEDS[64:264]
+JUDGING_SEEDS = VALIDATION_SEEDS[64:264]
 """Seeds of the crystals that a finished run's agent is tested on; they choose nothing within a run."""
 
 REFERENCES = {"Cz-v0": ("paper", "paper-tuned", "lqg"), "CzCrystal-v0": ("compensated", "lqg-along")}
 """Classical controllers that an agent is shown beside while it learns, by environment."""
 References = Mapping[str, tuple[float, float]]
-"""Mean RMSE of each reference [mm], on the crystals of PICKING and of JUDGING."""
+"""Mean RMSE of each reference [mm], on the crystals of SELECTION_SEEDS and of JUDGING_SEEDS."""
 COLUMNS = "steps", "seconds", "validation_cost", "validation_rmse_mm", "pull_step_rms_mm_per_min", "failure_rate"
 """Figures of a validation; those of the references follow, the same in every row (:func:`reference_column`)."""
 
@@ -43,7 +43,7 @@ class Validation(NamedTuple):
     failure_rate: float
 
     def put_into(self, contract: Contract) -> Contract:
-        """The contract of an agent with these figures."""
+        """Return an agent's contract with these figures."""
         return replace(contract, validation_cost=self.cost, validation_rmse_mm=self.rmse_mm)
 
 
@@ -53,40 +53,37 @@ def reference_column(name: str) -> str:
 
 
 def validate(policy: Any, config: Config, seeds: Sequence[int]) -> Validation:
-    """Run one episode a seed."""
+    """Mean figures of a policy over one episode a seed."""
     measured = metrics(rollout(policy, config, seeds))
     figures = (costs(measured), measured.rmse_mm, measured.pull_step_rms_mm_per_min, measured.failure_rate)
     return Validation(*(float(figure.mean()) for figure in figures))
 
 
 def references(make_controller: Callable[[str, Config], Any], recipe: TrainingConfig) -> References:
-    """RMSEs of the classical controllers on the crystals of a recipe; ``make_controller`` makes one by its name."""
+    """RMSEs of classical controllers on a recipe's crystals, each designed for a crystal's own scenario.
+
+    ``make_controller`` makes a controller by its name.
+    """
     config = replace(recipe.config, observation="measured", action="direct")
 
     def rmse_mm(name: str, seeds: Sequence[int]) -> float:
-        return _by_scenario(lambda own: make_controller(name, own), config, seeds)
+        with closing(CzVectorEnv.from_config(config, len(seeds))) as env:
+            _, info = env.reset(seed=list(seeds))
+        drawn, total = info.get("scenario", [config.scenario.name] * len(seeds)), 0.0
+        for scenario in config.scenario.scenarios:
+            if own := [seed for seed, each in zip(seeds, drawn, strict=True) if each == scenario.name]:
+                alone = config.with_scenario(scenario)
+                total += len(own) * validate(make_controller(name, alone), alone, own).rmse_mm
+        return total / len(seeds)
 
-    return {name: (rmse_mm(name, PICKING), rmse_mm(name, JUDGING)) for name in REFERENCES[config.process.name]}
-
-
-def _by_scenario(make: Callable[[Config], Any], config: Config, seeds: Sequence[int]) -> float:
-    """Mean RMSE [mm] of a controller with its design for each crystal's own scenario, as in the benchmark."""
-    with closing(CzVectorEnv.from_config(config, len(seeds))) as env:
-        _, info = env.reset(seed=list(seeds))
-    drawn, total = info.get("scenario", [config.scenario.name] * len(seeds)), 0.0
-    for scenario in config.scenario.scenarios:
-        if own := [seed for seed, name in zip(seeds, drawn, strict=True) if name == scenario.name]:
-            alone = config.with_scenario(scenario)
-            total += len(own) * validate(make(alone), alone, own).rmse_mm
-    return total / len(seeds)
+    names = REFERENCES[config.process.name]
+    return {name: (rmse_mm(name, SELECTION_SEEDS), rmse_mm(name, JUDGING_SEEDS)) for name in names}
 
 
 def costs(measured: Metrics) -> Floats:
-    """Mean cost of a step of each episode (:attr:`Validation.cost`), shape (episodes,)."""
+    """Mean cost of a step of each episode [-] (:attr:`Validation.cost`), shape (episodes,)."""
     return np.where(measured.failure_rate > 0, COST_CAP, np.minimum(measured.cost, COST_CAP))
 
-
-# Learning curves: validation error against steps and time, beside the classical controllers on the same crystals.
 
 AXES = (("steps", 1e6, "environment steps [million]"), ("seconds", 60.0, "minutes, validation included"))
 """Horizontal axes: column of a run's progress, unit, label."""
@@ -104,9 +101,9 @@ def curves(runs: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> bytes:
         for name, several in runs.items():
             for place, rows in enumerate(several):
                 spent, error = ([float(row[each]) for row in rows] for each in (column, "validation_rmse_mm"))
-                look = {"color": style[name].colour, "marker": style[name].marker}
+                drawn = {"color": style[name].colour, "marker": style[name].marker}
                 label = name if place == 0 and axis is panels[0] else None
-                axis.plot([each / unit for each in spent], error, ms=2.5, lw=1.0, label=label, **look)
+                axis.plot([each / unit for each in spent], error, ms=2.5, lw=1.0, label=label, **drawn)
         references = {name.removesuffix("_rmse_mm"): float(last[name]) for name in [*last][len(COLUMNS) :]}
         for name, rmse in references.items():
             axis.axhline(rmse, color=INK, lw=0.9, ls="--")

@@ -5,25 +5,24 @@ Each is judged on validation crystals of ``randomized``, on the way and at the e
 """
 
 import argparse
-import csv
-import io
 import pkgutil
 import sys
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from cz_gym.agents.from_sb3 import ALGORITHMS
-from cz_gym.agents.validation import JUDGING, validate
+from cz_gym.agents.validation import JUDGING_SEEDS, validate
 from cz_gym.config import make_config
-from cz_gym.support.command_line import OneLineParser, between
+from cz_gym.support.command_line import between
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import write_files
 from cz_gym.support.names import unknown_name_message
 from cz_gym.tools.registry import make_controller
 from cz_gym.tools.report.tables import markdown
+
+from .common import StudyParser
 
 MILLION = 1_000_000
 SHORT = (MILLION // 4, MILLION // 2)
@@ -88,7 +87,7 @@ ABOUT = """# Stock learners: stable-baselines3 on the environment as it comes
 
 
 def train(name: str, seed: int) -> list[tuple[Any, ...]]:
-    """Rows of :data:`COLUMNS`: one learner and training seed, after each number of actions."""
+    """Train one learner with a training seed; rows of :data:`COLUMNS`, after each number of actions."""
     import torch
     from stable_baselines3.common.vec_env import VecNormalize
 
@@ -106,56 +105,53 @@ def train(name: str, seed: int) -> list[tuple[Any, ...]]:
     for before, actions in pairwise((0, *learner.judged)):
         model.learn(actions - before, reset_num_timesteps=False)
         agent = to_agent(model, "stock", seed, config, model.get_vec_normalize_env(), "stock.onnx")
-        judged = validate(agent, config, JUDGING)
-        rows.append((learner.words, seed, actions, f"{judged.rmse_mm:.4f}", f"{judged.failure_rate:.4f}"))
+        judged = validate(agent, config, JUDGING_SEEDS)
+        rows.append((learner.words, seed, actions, round(judged.rmse_mm, 4), round(judged.failure_rate, 4)))
     return rows
 
 
-def report(rows: Sequence[Sequence[str]]) -> str:
-    """The table of all runs."""
-    groups = dict[tuple[str, str], list[Sequence[str]]]()
-    order = [each.words for each in LEARNERS.values()]
-    for row in sorted(rows, key=lambda row: (order.index(row[0]), int(row[2]), int(row[1]))):
-        groups.setdefault((row[0], row[2]), []).append(row)
+def report(runs: Any) -> str:
+    """Table of all runs, a data frame of :data:`COLUMNS`."""
     config = make_config("randomized", None, "measured", action="direct")
-    pid = validate(make_controller("paper-tuned", config), config, JUDGING).rmse_mm
-    table = [
-        (words, f"{int(steps) / MILLION:g} M", str(len(of)), " / ".join(f"{float(row[3]):.3f}" for row in of),
-         " / ".join(f"{100.0 * float(row[4]):.1f}" for row in of))
-        for (words, steps), of in groups.items()
-    ]  # fmt: skip
-    return "\n\n".join([ABOUT.format(crystals=len(JUDGING), pid=pid), markdown(HEADS, table)])
+    pid = validate(make_controller("paper-tuned", config), config, JUDGING_SEEDS).rmse_mm
+    order = [each.words for each in LEARNERS.values()]
+    runs = runs.sort_values(
+        ["learner", "steps", "seed"], key=lambda c: c.map(order.index) if c.name == "learner" else c
+    )
+    table = []
+    for (words, steps), own in runs.groupby(["learner", "steps"], sort=False):
+        errors, lost = (" / ".join(map(form.format, own[c])) for c, form in (("rmse_mm", "{:.3f}"), ("lost", "{:.1%}")))
+        table.append((words, f"{steps / MILLION:g} M", str(len(own)), errors, lost.replace("%", "")))
+    return "\n\n".join([ABOUT.format(crystals=len(JUDGING_SEEDS), pid=pid), markdown(HEADS, table)])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser(prog="python -m studies.stock", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("learners", nargs="*", metavar="LEARNER", help=f"of: {', '.join(LEARNERS)} (default: all)")
-    parser.add_argument(
-        "--seeds", type=between(1, 100), default=3, help="training seeds of each (default: %(default)s)"
-    )
-    parser.add_argument("--out", type=Path, default=Path("results/stock"), help="folder (default: %(default)s)")
-    return parser.run(_main, arguments, "agents")
+    parser = StudyParser("stock", __doc__, "results/stock")
+    add = parser.add_argument
+    add("learners", nargs="*", metavar="LEARNER", help=f"of: {', '.join(LEARNERS)} (default: all)")
+    add("--seeds", type=between(1, 100), default=3, help="training seeds of each (default: %(default)s)")
+    return parser.run(_main, arguments, "agents,benchmark")
 
 
 def _main(given: argparse.Namespace) -> None:
+    import pandas as pd
+
     for name in given.learners:
         if name not in LEARNERS:
             raise CzError(unknown_name_message("learner", name, LEARNERS))
-    runs, table = given.out / "runs.csv", given.out / "table.md"
-    rows = list(csv.reader(runs.read_text().splitlines()))[1:] if runs.exists() else []
+    path, table = given.out / "runs.csv", given.out / "table.md"
+    runs = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=COLUMNS)
     known = {each.words for each in LEARNERS.values()}
-    if any(len(row) != len(COLUMNS) or row[0] not in known for row in rows):
-        raise CzError(f"{runs}: no runs of this study, or damaged")
-    done = {(row[0], row[1]) for row in rows}
+    if [*runs.columns] != [*COLUMNS] or runs.isna().any(axis=None) or not set(runs["learner"]) <= known:
+        raise CzError(f"{path}: no runs of this study, or damaged")
     for seed in range(given.seeds):
         for name in given.learners or LEARNERS:
-            if (LEARNERS[name].words, str(seed)) not in done:
-                rows += [list(map(str, row)) for row in train(name, seed)]
-                text = io.StringIO()
-                csv.writer(text, lineterminator="\n").writerows([COLUMNS, *rows])
-                write_files({runs: text.getvalue().encode()})
-    write_files({table: f"{report(rows)}\n".encode()})
+            if not ((runs["learner"] == LEARNERS[name].words) & (runs["seed"] == seed)).any():
+                new = pd.DataFrame(train(name, seed), columns=COLUMNS)
+                runs = pd.concat([runs, new]) if len(runs) else new
+                write_files({path: runs.to_csv(index=False, float_format="%.4f", lineterminator="\n").encode()})
+    write_files({table: f"{report(runs)}\n".encode()})
     print(table.read_text())
 
 

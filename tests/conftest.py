@@ -99,9 +99,9 @@ def few_crystals(monkeypatch):
     from cz_gym.agents import validation
     from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
-    monkeypatch.setattr(validation, "PICKING", VALIDATION_SEEDS[:2])
-    monkeypatch.setattr(validation, "JUDGING", VALIDATION_SEEDS[2:4])
-    monkeypatch.setattr("cz_gym.agents.from_sb3.JUDGING", VALIDATION_SEEDS[2:4])
+    monkeypatch.setattr(validation, "SELECTION_SEEDS", VALIDATION_SEEDS[:2])
+    monkeypatch.setattr(validation, "JUDGING_SEEDS", VALIDATION_SEEDS[2:4])
+    monkeypatch.setattr("cz_gym.agents.from_sb3.JUDGING_SEEDS", VALIDATION_SEEDS[2:4])
 
 
 @pytest.fixture(scope="session")

@@ -21,7 +21,7 @@ TRAIN = TrainingRun.train
 
 def train_small(run: TrainingRun, bar: Any = None) -> dict[str, float]:
     """:meth:`TrainingRun.train` with few validation episodes."""
-    validation.PICKING, validation.JUDGING = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]
+    validation.SELECTION_SEEDS, validation.JUDGING_SEEDS = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]
     return TRAIN(run, bar)
 
 

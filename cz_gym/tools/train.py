@@ -1,4 +1,4 @@
-"""``cz-gym train``: train an agent by a recipe, or several training seeds side by side."""
+"""``cz-gym train``: train an agent by a recipe, or several training seeds in parallel."""
 
 import argparse
 import shlex
@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from cz_gym.agents.recipes import CRYSTAL, CRYSTAL_RECIPES, CZ, DEFAULT, FEW_UPDATES, RECIPES, TrainingConfig
+from cz_gym.agents.recipes import CRYSTAL_ENV, CRYSTAL_RECIPES, DEFAULT_RECIPE, FEW_UPDATES, RECIPES, TrainingConfig
 from cz_gym.agents.train import read_settings
 from cz_gym.config import check_config
+from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.puller.file import chosen_puller
 from cz_gym.support.command_line import OneLineParser, between, interpreter, run_command
 from cz_gym.support.errors import CzError
@@ -25,8 +26,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         epilog="The run folder holds the agent with its contract, settings, checkpoints, progress and logs.",
     )
     add = parser.add_argument
-    add("--algo", choices=RECIPES, help=f"recipe (default: {DEFAULT}, or the resumed run's)")
-    add("--env", choices=(CZ, CRYSTAL), help=f"environment (default: {CZ}, or the resumed run's)")
+    add("--algo", choices=RECIPES, help=f"recipe (default: {DEFAULT_RECIPE}, or the resumed run's)")
+    add("--env", choices=ENVIRONMENTS, help="environment (default: Cz-v0, or the resumed run's)")
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--seed", type=between(0, 2**63 - 1), help="training seed (default: 0, or the resumed run's)")
     about = "training seeds side by side, a processor each; with --resume those that are not finished"
@@ -49,8 +50,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         parser.error("--cluster shares --seeds FIRST-LAST between machines: a single seed is one task")
     suffix = "" if arguments.seeds else f"-seed{arguments.seed or 0}"
     puller = f"-{Path(arguments.puller).stem}" if arguments.puller else ""
-    crystal = "-crystal" if arguments.env == CRYSTAL else ""
-    arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT}{crystal}{puller}{suffix}"
+    crystal = "-crystal" if arguments.env == CRYSTAL_ENV else ""
+    arguments.out = arguments.out or Path("runs") / f"{arguments.algo or DEFAULT_RECIPE}{crystal}{puller}{suffix}"
     return arguments
 
 
@@ -116,8 +117,8 @@ def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tupl
     if begun and not arguments.resume:
         raise CzError(f"{begun[0]} holds a run already: --resume it, or name another --out")
     saved = read_settings((begun or folders)[0] / "settings.json") if arguments.resume else {}
-    settings, agents = saved.get("settings", {}), saved.get("algorithm", DEFAULT)
-    recipes = CRYSTAL_RECIPES if (arguments.env or settings.get("environment")) == CRYSTAL else RECIPES
+    settings, agents = saved.get("settings", {}), saved.get("algorithm", DEFAULT_RECIPE)
+    recipes = CRYSTAL_RECIPES if (arguments.env or settings.get("environment")) == CRYSTAL_ENV else RECIPES
     name = arguments.algo or {recipe.name: key for key, recipe in recipes.items()}.get(agents, agents)
     if name not in recipes:
         raise CzError(f"{name!r} is no recipe here: name one of {', '.join(recipes)} by --algo")

@@ -9,7 +9,7 @@ from onnx import TensorProto, helper, numpy_helper, parser
 
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
 from cz_gym.agents.contract import make_contract, read_agent
-from cz_gym.agents.graph import MAX_ACTIVATIONS, MAX_NODES, OPERATORS, checked
+from cz_gym.agents.graph import MAX_ACTIVATIONS, MAX_NODES, OPERATORS, check_graph
 from cz_gym.config import make_config
 from cz_gym.spaces import MEASURED
 from tests import contracts
@@ -33,7 +33,7 @@ def policy_of(model):
 @pytest.mark.parametrize("name", ["gradient", "ppo"])
 def test_the_shipped_agent_is_run_as_it_is_stored(name):
     contract, content = read_agent(shipped(name))
-    clean, state = checked(content, contract.channels)
+    clean, state = check_graph(content, contract.channels)
     assert (state > 0) == (name == "gradient")
     ours, theirs = onnx.load_from_string(clean).graph, onnx.load_from_string(content).graph
     for node in theirs.node:
@@ -62,7 +62,7 @@ def test_an_agent_with_a_memory_begins_each_episode_at_zero():
         "outputs": [value("action", "n", 2), value("next_state", "n", 2)],
     }
     policy = policy_of(model_of(nodes, weights, **both))
-    assert policy.remembers == 2
+    assert policy.memory_length == 2
     seen, state = np.zeros((3, CHANNELS), np.float32), None
     for begins in ([True] * 3, [0, 0, 0], [0.0, 1.0, 0.0]):
         action, state = policy.predict(seen, state, episode_start=np.array(begins))

@@ -17,15 +17,15 @@ SEEDS = range(1_000_000, 1_000_006)
 
 
 def test_crystals_that_judge_neither_select_nor_test():
-    judged = set(validation.JUDGING)
+    judged = set(validation.JUDGING_SEEDS)
     assert judged <= set(VALIDATION_SEEDS)
-    assert not judged & (set(validation.PICKING) | set(TEST_SEEDS))
+    assert not judged & (set(validation.SELECTION_SEEDS) | set(TEST_SEEDS))
 
 
 @pytest.mark.parametrize("scenario", ["randomized", "randomized=0.4,hard=0.2,puller=0.4"])
 def test_a_reference_has_its_design_for_each_crystal(scenario, monkeypatch):
-    monkeypatch.setattr(validation, "PICKING", SEEDS)
-    monkeypatch.setattr(validation, "JUDGING", SEEDS[:1])
+    monkeypatch.setattr(validation, "SELECTION_SEEDS", SEEDS)
+    monkeypatch.setattr(validation, "JUDGING_SEEDS", SEEDS[:1])
     monkeypatch.setattr(validation, "REFERENCES", {"Cz-v0": ("paper-tuned",)})
     recipe = replace(PPO(), scenario=scenario)
     config = replace(recipe.config, observation="measured", action="direct")

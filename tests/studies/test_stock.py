@@ -8,9 +8,7 @@ def test_runs_are_kept_and_the_table_has_each_seed(tmp_path, monkeypatch, capsys
 
     def train(name, seed):
         trained.append((name, seed))
-        return [
-            (stock.LEARNERS[name].words, seed, steps, f"{0.1 + seed:.4f}", "0.0050") for steps in (1_000_000, 2_000_000)
-        ]
+        return [(stock.LEARNERS[name].words, seed, steps, 0.1 + seed, 0.005) for steps in (1_000_000, 2_000_000)]
 
     monkeypatch.setattr(stock, "train", train)
     name = next(iter(stock.LEARNERS))

@@ -102,7 +102,7 @@ class Agent:
         contract, ranges = policy.contract, config.ranges
         if contract.observation not in ("measured", "history"):
             raise CzError(f"an agent that reads {contract.observation!r} cannot be exported: no plant has that")
-        self.network, self.remembers, self.ranges = network_of(policy.content), policy.remembers, ranges
+        self.network, self.remembers, self.ranges = network_of(policy.content), policy.memory_length, ranges
         self.v_0, self.heater_range = ranges
         self.slack = HEATER_SLACK * max(each.actuators.heater_step for each in config.scenario.scenarios)
         self.dt = contract.control_interval
