@@ -1,11 +1,9 @@
 """``cz-gym recipe``: the set points of a whole crystal against its length, what an operator loads."""
 
 import argparse
-import csv
-import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -19,55 +17,47 @@ from cz_gym.support.command_line import OneLineParser, relative_path
 from cz_gym.support.files import write_files
 from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
-_PRINTED = 16
+ROWS_PRINTED = 16
+PRINTED = {
+    "length mm": "length_mm", "time h": "time_h", "radius mm": "radius_mm", "cone deg": "cone_angle_deg",
+    "pull mm/min": "pull_speed_mm_per_min", "heater kW": "heater_power_kW", "T_1 K": "T_1_K",
+    "superheat K": "superheat_K", "meniscus mm": "meniscus_height_mm", "mass kg": "crystal_mass_kg",
+}  # fmt: skip
+"""Columns of the table that are printed, by their headings."""
 
 
-class SetPoints(NamedTuple):
-    """The set points at a length, in the units that people read; arrays along the crystal."""
+def recipe_table(puller: PullerFile) -> Any:
+    """Tabulate a puller's recipe against length in a pandas DataFrame, in the units that its columns name.
 
-    length_mm: Any
-    time_min: Any
-    radius_mm: Any
-    cone_angle_deg: Any
-    growth_rate_mm_per_min: Any
-    pull_speed_mm_per_min: Any
-    heater_power_kW: Any
-    T_1_K: Any
-    superheat_K: Any
-    meniscus_height_mm: Any
-    ring_radius_mm: Any
-    crystal_mass_kg: Any
-    crucible_lift_mm_per_min: Any
+    Raises CzError, with the length, for what cannot be grown.
+    """
+    import pandas
 
-
-def set_points(puller: PullerFile) -> SetPoints:
-    """The recipe of a puller, a value a row of its table; CzError, with the length, for what cannot be grown."""
     config = make_config(process=CRYSTAL, puller=puller, stage="whole")
     p, table = nominal_recipe(config.parameters._replace(**dict.fromkeys(CRYSTAL.apart, 0.0)), config.meniscus)
     at, L = recipe.RecipeRow(*table.T), lengths(p)
-    inside = slice(recipe.MARGIN, recipe.ROWS - recipe.MARGIN)
     r, slope, v_g = (np.array(column) for column in zip(*(shape_at(each, p, Episode()) for each in L), strict=True))
     level = (p.M_0 - at.M_s - at.M_men) / (p.rho_l * np.pi * p.R_cr**2)
-    columns = SetPoints(
-        L / MM, (at.t - at.t[recipe.MARGIN]) / MINUTE, r / MM,
-        np.degrees(np.arctan(slope)).round(9) + 0.0, v_g / MM_PER_MIN,
-        at.v_p / MM_PER_MIN, at.Q_H / KILO, at.T_1, at.T_b - p.T_m, at.h_c / MM, (r + at.ring) / MM, at.M_s,
-        -np.gradient(level, at.t) / MM_PER_MIN,
-    )  # fmt: skip
-    return SetPoints(*(column[inside] for column in columns))
+    columns = {
+        "length_mm": L / MM,
+        "time_min": (at.t - at.t[recipe.MARGIN]) / MINUTE,
+        "radius_mm": r / MM,
+        "cone_angle_deg": np.degrees(np.arctan(slope)).round(9) + 0.0,
+        "growth_rate_mm_per_min": v_g / MM_PER_MIN,
+        "pull_speed_mm_per_min": at.v_p / MM_PER_MIN,
+        "heater_power_kW": at.Q_H / KILO,
+        "T_1_K": at.T_1,
+        "superheat_K": at.T_b - p.T_m,
+        "meniscus_height_mm": at.h_c / MM,
+        "ring_radius_mm": (r + at.ring) / MM,
+        "crystal_mass_kg": at.M_s,
+        "crucible_lift_mm_per_min": -np.gradient(level, at.t) / MM_PER_MIN,
+    }
+    return pandas.DataFrame(columns)[recipe.MARGIN : recipe.ROWS - recipe.MARGIN]
 
 
-def to_csv(rows: SetPoints) -> str:
-    """The set points as comma-separated values, one line a length."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(SetPoints._fields)
-    writer.writerows([f"{value:.6g}" for value in row] for row in zip(*rows, strict=True))
-    return text.getvalue()
-
-
-def draw(rows: SetPoints, title: str) -> bytes:
-    """Picture of the set points: the crystal's outline, then drives and temperatures, as PNG."""
+def draw(rows: Any, title: str) -> bytes:
+    """Draw the rows of a recipe: the crystal's outline, then drives and temperatures, as PNG."""
     from cz_gym.evaluation.plots import canvas, png
 
     figure = canvas(8.0, 7.0)
@@ -96,17 +86,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> None:
     puller = chosen_puller(given.puller)
-    rows = set_points(puller)
-    every = np.linspace(0, len(rows.length_mm) - 1, _PRINTED).round().astype(int)
-    headed = {
-        "length mm": rows.length_mm, "time h": rows.time_min / 60.0, "radius mm": rows.radius_mm,
-        "cone deg": rows.cone_angle_deg, "pull mm/min": rows.pull_speed_mm_per_min, "heater kW": rows.heater_power_kW,
-        "T_1 K": rows.T_1_K, "superheat K": rows.superheat_K, "meniscus mm": rows.meniscus_height_mm,
-        "mass kg": rows.crystal_mass_kg,
-    }  # fmt: skip
-    files = {given.out / "recipe.csv": to_csv(rows).encode(), given.out / "recipe.png": draw(rows, puller.label)}
+    rows = recipe_table(puller)
+    text = rows.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+    files = {given.out / "recipe.csv": text.encode(), given.out / "recipe.png": draw(rows, puller.label)}
     write_files(files)
-    print(" ".join(f"{heading:>11}" for heading in headed))
-    for i in every:
-        print(" ".join(f"{column[i]:>11.4g}" for column in headed.values()))
+    printed = rows.assign(time_h=rows.time_min / 60.0)[list(PRINTED.values())]
+    print(" ".join(f"{heading:>11}" for heading in PRINTED))
+    for i in np.linspace(0, len(rows) - 1, ROWS_PRINTED).round().astype(int):
+        print(" ".join(f"{value:>11.4g}" for value in printed.iloc[i]))
     print("wrote", ", ".join(relative_path(path) for path in files))
