@@ -1,8 +1,11 @@
-"""Policies whose episodes are recorded, by name, and the scores that learners from their episodes are compared with."""
+"""Datasets for offline learning, in Minari's format: ``cz-gym data`` (extra ``data``).
+
+All policies are recorded in one form: "history" observations, "direct" actions, rewards, and as info the radius and
+the true state. Datasets of different policies can therefore be joined, and seed and actions reproduce an episode.
+"""
 
 import argparse
 import os
-import pkgutil
 import re
 import shutil
 import sys
@@ -24,6 +27,7 @@ import numpy.typing as npt
 from scipy.signal import lfilter
 
 import cz_gym
+from cz_gym import agents
 from cz_gym.config import Config, check_config, make_config
 from cz_gym.env import CzVectorEnv
 from cz_gym.evaluation.parallel import side_by_side
@@ -36,19 +40,23 @@ from cz_gym.support.errors import CzError
 from cz_gym.support.files import check_writable
 from cz_gym.support.names import unknown_name_message
 from cz_gym.tools.identify.moves import Excited
+from cz_gym.tools.registry import CONTROLLERS
 
-CONTROLLERS, AGENTS = "cz_gym.tools.registry:CONTROLLERS", "cz_gym.agents:load"
-"""Names of the objects that provide policies; imported only when needed, because this package knows no policy."""
+EPISODES, NOISE = 100, 0.2
+"""Default number of episodes, and default highest level of the excitation [-]."""
+AT_ONCE = 100
+"""Number of episodes in one batch."""
 OWN = "random", "operator", "mixed"
-"""Names of policies that only data sets have."""
+"""Names of policies that only datasets have."""
 MIXED = "paper", "lqg", "pid-uncompensated", "random"
 """Policies that take turns in the set "mixed"; the last two lose crystals."""
-RANDOM_STREAM = 2
-"""Random stream of random actions, separate from those of the crystal and its excitation with the same seed."""
+EXCITATION_STREAM, RANDOM_STREAM = 1, 2
+"""Random streams of the excitation and of random actions, separate from those of the crystal with the same seed."""
+CODE = "https://github.com/cz-gym/cz-gym"
 
 
 class Random:
-    """A policy of uniform random "smooth" actions; each crystal's seed gives its own."""
+    """Policy of uniform random "smooth" actions; each crystal's seed gives its own."""
 
     settings = MappingProxyType({"action": "smooth"})
 
@@ -56,7 +64,7 @@ class Random:
         self.streams = [np.random.default_rng([seed, RANDOM_STREAM]) for seed in seeds]
 
     def for_episodes(self, config: Config, seeds: Sequence[int]) -> "Random":
-        """The policy for one episode a seed."""
+        """Return the policy for one episode a seed."""
         return Random(seeds)
 
     def predict(self, observation: Any, state: Any = None, **_: Any) -> tuple[Any, Any]:
@@ -65,12 +73,12 @@ class Random:
 
 
 def find_policy(name: str, config: Config) -> Any:
-    """The policy of that name, made for a config; a tuple of several for "mixed". CzError lists the known names.
+    """Make the policy of that name for a config; a tuple of several for "mixed". CzError lists the known names.
 
-    It is a controller, a shipped agent, an agent's file, "random" or "operator", a PID with small moves of the drives
-    on top, as an operator's log for identification has them.
+    Names are those of controllers and shipped agents, an agent's file, "random", and "operator": a PID with small moves
+    of the drives on top, as an operator's log for identification has them.
     """
-    controllers = {entry.name: entry for entry in pkgutil.resolve_name(CONTROLLERS) if not entry.privileged}
+    controllers = {entry.name: entry for entry in CONTROLLERS if not entry.privileged}
     check_config(config)
     if name in controllers:
         return controllers[name].make(config)
@@ -80,12 +88,11 @@ def find_policy(name: str, config: Config) -> Any:
         return Excited(find_policy("paper", config))
     if name == "mixed":
         return tuple(find_policy(each, config) for each in MIXED)
-    load = pkgutil.resolve_name(AGENTS)
     try:
-        settings = settings_of(load(name))
+        settings = settings_of(agents.load(name))
     except ValueError as error:
         raise CzError(unknown_name_message("policy", name, [*controllers, *OWN], f"; or an agent: {error}")) from None
-    return load(name, replace(config, **settings))
+    return agents.load(name, replace(config, **settings))
 
 
 @lru_cache(maxsize=8)
@@ -94,52 +101,37 @@ def reference_scores(config: Config) -> dict[str, float]:
 
     The crystals are the first 100 of validation; the controllers are those of README's table.
     """
-    table = pkgutil.resolve_name(CONTROLLERS)
-    chosen = [each for each in table if each.name == "open-loop" or (each.quoted and not each.bound)]
+    chosen = [each for each in CONTROLLERS if each.name == "open-loop" or (each.quoted and not each.bound)]
     runs = [rollout(each.make(config), config, VALIDATION_SEEDS[:100]) for each in chosen]
     means = [float(run.reward.sum(axis=0).mean()) for run in runs]
     return {"ref_min_score": means[0], "ref_max_score": max(means)}
 
 
 def settings_of(policy: Any) -> dict[str, Any]:
-    """The environment settings "observation" and "action" of a policy; by default "measured" and "direct"."""
+    """Environment settings "observation" and "action" of a policy; by default "measured" and "direct"."""
     settings = {"observation": "measured", "action": "direct"} | getattr(policy, "settings", {})
     return {name: settings[name] for name in ("observation", "action")}
 
 
-def own_noise(policy: Any, noise: float) -> float:
-    """The highest level of the excitation [-] of a policy: 0 for one that moves the drives by itself."""
+def highest_noise(policy: Any, noise: float) -> float:
+    """Highest level of the excitation [-] of a policy: 0 for one that moves the drives by itself, else ``noise``."""
     return 0.0 if isinstance(policy, Random | Excited) else noise
 
 
-# Datasets for offline learning, in Minari's format: ``cz-gym data`` (extra ``data``).
-#
-# All policies are recorded in one form: "history" observations, "direct" actions, rewards, and as info the radius and
-# the true state. Datasets of different policies can therefore be joined, and seed and actions reproduce an episode.
-
-EPISODES, NOISE = 100, 0.2
-"""Default number of episodes, and default highest level of the excitation [-]."""
-AT_ONCE = 100
-"""Number of episodes in one batch."""
-STREAM = 1
-"""Random stream of the excitation, separate from that of the crystal with the same seed."""
-CODE = "https://github.com/cz-gym/cz-gym"
-
-
 def excitation(seed: int, config: Config, noise: float) -> tuple[float, npt.NDArray[np.float64]]:
-    """Noise that excites the drives in one episode: its level [-], and "direct" actions of shape (steps, 2).
+    """Draw the noise that excites the drives in one episode: its level [-], and "direct" actions of shape (steps, 2).
 
-    It is white noise passed through the lags of "smooth" actions (50 s). The level is the white noise's standard
+    They are white noise passed through the lags of "smooth" actions (50 s). The level is the white noise's standard
     deviation, drawn uniformly between 0 and ``noise``, so that a dataset has quiet and excited episodes.
     """
-    random, drives = np.random.default_rng([seed, STREAM]), drives_of("smooth", config.control_interval)
+    random, drives = np.random.default_rng([seed, EXCITATION_STREAM]), drives_of("smooth", config.control_interval)
     level = noise * random.uniform()
     white = level * random.standard_normal((config.steps, 2)) * np.array([drives.pull, drives.heater])
     return level, lfilter([1.0], [1.0, -drives.keep], white, axis=0)
 
 
 def record(policy: Any, config: Config, seeds: Sequence[int], noise: float) -> list[dict[str, Any]]:
-    """Run one episode per seed, all in one batch; the fields of Minari's ``EpisodeBuffer`` for each episode.
+    """Run one episode a seed, all in one batch; return the fields of Minari's ``EpisodeBuffer`` for each episode.
 
     The policies of a tuple take turns from seed to seed.
     """
@@ -147,7 +139,7 @@ def record(policy: Any, config: Config, seeds: Sequence[int], noise: float) -> l
         turns = [[seed for seed in seeds if policy[seed % len(policy)] is each] for each in policy]
         parts = [record(each, config, turn, noise) for each, turn in zip(policy, turns, strict=True) if turn]
         return sorted((episode for part in parts for episode in part), key=lambda each: seeds.index(each["seed"]))
-    settings, n, noise = settings_of(policy), len(seeds), own_noise(policy, noise)
+    settings, n, noise = settings_of(policy), len(seeds), highest_noise(policy, noise)
     policy = informed(policy, config, seeds)
     drives = drives_of(settings["action"], config.control_interval, config.heater_range)
     gains, place = np.array([drives.pull, drives.heater]), list(DRIVE_CHANNELS)
@@ -185,8 +177,8 @@ def record(policy: Any, config: Config, seeds: Sequence[int], noise: float) -> l
     ]
 
 
-def name_of(policy: str) -> str:
-    """The name of a policy: of an agent's file its own, or for "agent.onnx" its folder's, "ppo-seed1" of ppo/seed1."""
+def policy_label(policy: str) -> str:
+    """Name of a policy in a dataset: an agent file's own, or for ``agent.onnx`` its folder's, as "ppo-seed1"."""
     path = Path(policy).absolute()
     if path.suffix != ".onnx" or path.stem != "agent":
         return path.stem if path.suffix == ".onnx" else policy
@@ -194,17 +186,17 @@ def name_of(policy: str) -> str:
     return f"{folder.parent.name}-{folder.name}" if seed else folder.name
 
 
-def place_of(name: str, scenario: str, puller: PullerFile) -> str:
-    """The identifier ``cz/<scenario>/<policy>-v0`` of a dataset, with the puller before the scenario if it has a file.
+def dataset_id(name: str, scenario: str, puller: PullerFile) -> str:
+    """Identifier ``cz/<scenario>/<policy>-v0`` of a dataset, with the puller before the scenario if it has a file.
 
     "_" stands for what Minari does not take.
     """
-    parts = ["cz", *([puller.name] if puller != DEFAULT else []), scenario, f"{name_of(name)}-v0"]
+    parts = ["cz", *([puller.name] if puller != DEFAULT else []), scenario, f"{policy_label(name)}-v0"]
     return "/".join(re.sub(r"[^-\w]+", "_", part, flags=re.ASCII) for part in parts)
 
 
 def datasets_root() -> Path:
-    """Minari's folder of datasets; CzError where the user has no home."""
+    """Return Minari's folder of datasets; CzError where the user has no home."""
     try:
         return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
     except RuntimeError:
@@ -222,7 +214,7 @@ def write(
     puller: PullerFile = DEFAULT,
     scored: bool = False,
 ) -> Any:
-    """Write a Minari dataset, whose name is :func:`place_of`, and return it.
+    """Write a Minari dataset, whose name is :func:`dataset_id`, and return it.
 
     The numbers of the puller stand in it, so ``recover_environment`` gives the same puller back. ``scored`` adds
     :func:`reference_scores`. Raises CzError for seeds that are not training seeds, and for a dataset that exists
@@ -231,7 +223,7 @@ def write(
     minari, _ = import_module("minari"), import_module("h5py")
     settings: dict[str, Any] = {"scenario": scenario, "observation": "history", "action": "direct", "horizon": horizon}
     settings |= {"puller": to_toml(puller)} if puller != DEFAULT else {}  # a spec is JSON
-    config, place = make_config(**settings), place_of(name, scenario, puller)
+    config, place = make_config(**settings), dataset_id(name, scenario, puller)
     if not seeds or not set(seeds) <= set(TRAINING_SEEDS):
         raise CzError(f"seeds must be some of the training seeds, {TRAINING_SEEDS[0]} to {TRAINING_SEEDS[-1]}")
     if not 0.0 <= noise <= 1.0:
@@ -249,14 +241,14 @@ def write(
     try:
         with closing(gym.make(cz_gym.ENV_ID, **settings)) as env, warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # author and address are the user's own to give
-            said = name_of(name)
+            said = policy_label(name)
             facts = {"algorithm_name": said, "code_permalink": CODE, "description": f"{said} on {scenario}, excited"}
             scores: Any = reference_scores(replace(config, observation="measured")) if scored else {}
             dataset = minari.create_dataset_from_buffers(place, begun, env, env, **facts, **scores)
         for first in range(AT_ONCE, len(seeds), AT_ONCE):
             dataset.update_dataset_from_buffer(buffers(first))
         turns = policy if isinstance(policy, tuple) else (policy,)
-        noises = [own_noise(turns[seed % len(turns)], noise) for seed in seeds]
+        noises = [highest_noise(turns[seed % len(turns)], noise) for seed in seeds]
         levels = map(excitation, seeds, repeat(config), noises)
         dataset.storage.update_episode_metadata([{"excitation": level} for level, _ in levels])
         dataset.storage.update_metadata({"cz_gym_version": cz_gym.__version__, "plant_hash": config.plant_hash})

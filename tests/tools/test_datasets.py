@@ -11,8 +11,7 @@ from cz_gym.evaluation.rollout import Playback, rollout
 from cz_gym.puller.file import DEFAULT, find_puller
 from cz_gym.spaces import DRIVE_CHANNELS
 from cz_gym.tools import datasets
-from cz_gym.tools import datasets as behaviour
-from cz_gym.tools.datasets import excitation, find_policy, main, place_of, record, settings_of, write
+from cz_gym.tools.datasets import dataset_id, excitation, find_policy, main, record, settings_of, write
 
 CONFIG = make_config("randomized", action="direct", horizon=1200.0)
 
@@ -20,7 +19,7 @@ CONFIG = make_config("randomized", action="direct", horizon=1200.0)
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "data"))
-    monkeypatch.setattr(behaviour, "VALIDATION_SEEDS", VALIDATION_SEEDS[:1])  # of the scores: 100 take 16 s
+    monkeypatch.setattr(datasets, "VALIDATION_SEEDS", VALIDATION_SEEDS[:1])  # of the scores: 100 take 16 s
     return tmp_path / "data"
 
 
@@ -70,7 +69,7 @@ def test_a_set_of_another_puller_gives_that_puller_back(place):
     ],
 )
 def test_names_are_what_minari_takes(name, expected):
-    assert place_of(name, "hard", DEFAULT) == expected
+    assert dataset_id(name, "hard", DEFAULT) == expected
 
 
 @pytest.mark.slow
