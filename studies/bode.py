@@ -26,7 +26,7 @@ from cz_gym.config import make_config
 from cz_gym.evaluation import user_code
 from cz_gym.physics.numerics import StateSpace
 from cz_gym.physics.plant import make_puller
-from cz_gym.puller import file as machine
+from cz_gym.puller.file import DEFAULT, PullerFile, chosen_puller
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import write_files
 from cz_gym.tools.registry import make_controller
@@ -35,11 +35,11 @@ from cz_gym.tools.report.tables import markdown as table
 from .common import StudyParser
 
 PLACES = {"camera": "ring", "v_p": "pull speed", "Q_H": "heater"}
-"""Places where the loop is opened, and their names."""
+"""Names of the places where the loop is opened."""
 
 
-def form_of(name: str, puller: machine.PullerFile = machine.DEFAULT) -> LinearForm:
-    """The linear form of a shipped controller, or of ``FILE.py:NAME``; ValueError says in one line why it has none."""
+def form_of(name: str, puller: PullerFile = DEFAULT) -> LinearForm:
+    """Linearise a shipped controller, or ``FILE.py:NAME``; ValueError says in one line why it has no linear form."""
     config = make_config("nominal", observation="measured", action="direct", puller=puller)
     sensor = make_config("randomized", puller=puller).sole_scenario.sensor
     policy = user_code.controller(name).make(config) if ":" in name else make_controller(name, config)
@@ -53,7 +53,7 @@ def phase_of(values: Any) -> Any:
 
 
 def picture(name: str, dt: float, loops: dict[str, StateSpace]) -> bytes:
-    """Gain and phase of the loops, by the place where they are opened, and their sensitivity, as PNG."""
+    """Draw gain and phase of the loops, by the place where they are opened, and their sensitivity, as PNG."""
     from cz_gym.evaluation.plots import COLOURS, GREY, canvas, png
 
     omega = frequencies(dt)
@@ -87,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(given: argparse.Namespace) -> None:
     if not 0.0 <= given.mix <= 1.0:
         raise CzError(f"--mix must lie in [0, 1], not {given.mix:g}")
-    own = machine.chosen_puller(given.puller)
+    own = chosen_puller(given.puller)
     form, puller = form_of(given.controller, own), make_puller(own.parameters, given.mix)
     heats = form.controller.C[1].any() or form.controller.D[1].any()
     stable = close(form.controller, puller, form.dt).stable

@@ -41,7 +41,7 @@ from .common import StudyParser
 PULLERS, CRYSTALS = 20, 20
 """Number of pullers, and of crystals of each."""
 HOT_ZONE, MELT = ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b", "eps"), ("sigma", "k_l")
-"""What the start file has wrong by PRIOR_SD, and by MELT_SD."""
+"""Parameters of the start file that are off by PRIOR_SD, and by MELT_SD."""
 MELT_SD = 0.1
 """Standard deviation of the logarithm of the melt's numbers in handbooks [-]."""
 ONE = Pullers(RANDOMIZED.pullers.mix, start_radius_sd=0.2 * MM)
@@ -50,7 +50,7 @@ SCENARIO = replace(RANDOMIZED, name="randomized, one puller", pullers=ONE)
 
 
 class Row(NamedTuple):
-    """The identification of a puller and its use."""
+    """Identification of a puller, and controllers designed for it."""
 
     truth: PullerFile
     identified: Identified
@@ -59,23 +59,23 @@ class Row(NamedTuple):
     rmse_mm: tuple[float, ...]
     """Root mean square radius error of the LQGs told the truth, the identified file and the start [mm]."""
     lost: tuple[int, ...]
-    """Crystals that they lost."""
+    """Number of crystals that each of these LQGs lost."""
 
     @property
     def inside(self) -> list[bool]:
-        """Whether the interval holds the truth, of every informed parameter."""
+        """True for each informed parameter whose interval holds the truth."""
         told = [e for e in self.identified.estimates if e.informed and e.name in Parameters._fields]
         return [e.low <= getattr(self.truth.parameters, e.name) <= e.high for e in told]
 
 
-def wrong(random: np.random.Generator) -> dict[str, float]:
-    """Factors of the truth over a start file, lognormal, by parameter."""
+def errors_of_start(random: np.random.Generator) -> dict[str, float]:
+    """Draw lognormal factors of the truth over a start file, by parameter."""
     sds = dict.fromkeys(HOT_ZONE, PRIOR_SD) | dict.fromkeys(MELT, MELT_SD)
     return {name: float(np.exp(sd * random.standard_normal())) for name, sd in sds.items()}
 
 
 def draw(number: int) -> tuple[PullerFile, PullerFile]:
-    """The start file and the truth of a puller."""
+    """Draw the start file and the truth of a puller."""
     random, default = np.random.default_rng([5, number]), Parameters()
     r_0 = random.uniform(50.0, 150.0) * MM
     area = (r_0 / default.r_0) ** 2
@@ -84,13 +84,13 @@ def draw(number: int) -> tuple[PullerFile, PullerFile]:
     v_0 = default.v_0 * random.uniform(0.7, 1.3) * (default.r_0 / r_0) ** 0.5
     hot_zone = {name: factor * getattr(default, name) for name, factor in scaled.items()}
     start = default._replace(r_0=r_0, v_0=v_0, R_cr=3.2 * r_0, **hot_zone)
-    truth = {name: getattr(start, name) * factor for name, factor in wrong(random).items()}
+    truth = {name: getattr(start, name) * factor for name, factor in errors_of_start(random).items()}
     file = PullerFile(f"puller {number}", start, heater_range=area * HEATER_RANGE)
     return file, replace(file, parameters=start._replace(**truth))
 
 
 def write_logs(truth: PullerFile, seed: int, folder: Path) -> tuple[Path, Path]:
-    """CSV files of three hours under a PID of the puller's own, with and without excitation."""
+    """Write CSV logs of three hours under a PID of the puller's own, with and without excitation."""
     env = CzEnv(SCENARIO, observation="measured", action="direct", puller=truth, info="all")
     (tuned,) = (each for each in PIDS if each.name == "pid-conventional")
     pid = tuned.settings(SCENARIO).for_config(env.config)
@@ -123,7 +123,7 @@ def study(number: int, crystals: int) -> Row:
 
 
 def report(rows: Sequence[Row]) -> str:
-    """The table and what follows from it."""
+    """Write the table and what follows from it."""
     heads = "diameter [mm]", "heater [kW]", "told", "inside", "LQG told truth [mm]", "identified", "start", "lost"
     lines = []
     for row in rows:

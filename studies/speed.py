@@ -38,7 +38,7 @@ UNFAILED = 50
 
 
 class Stepper(NamedTuple):
-    """An environment or loop whose steps are timed."""
+    """Environment or loop whose steps are timed."""
 
     num_envs: int
     step: Callable[[], Any]
@@ -57,7 +57,7 @@ RATIOS = {
 
 
 def cases(slots: int = SLOTS, sb3_slots: int = SB3_SLOTS) -> dict[str, Callable[[], Any]]:
-    """Functions that make an environment, scalar or batched, or a :class:`Stepper`, by the name of their row."""
+    """List functions that make an environment, scalar or batched, or a :class:`Stepper`, by the name of their row."""
     rows: dict[str, Callable[[], Any]] = {
         f"{name} scalar": partial(gym.make, name) for name in ("Cz-v0", "Pendulum-v1")
     }
@@ -79,7 +79,7 @@ def cases(slots: int = SLOTS, sb3_slots: int = SB3_SLOTS) -> dict[str, Callable[
 
 
 def stepper(env: Any) -> Stepper:
-    """The environment of any library, stepped with actions of zero and reset where it does not reset itself."""
+    """Step the environment of any library with actions of zero, and reset it where it does not reset itself."""
     if isinstance(env, Stepper):
         return env
     if getattr(env, "num_envs", None) is not None:
@@ -97,14 +97,14 @@ def stepper(env: Any) -> Stepper:
 
 
 def batched(env: Any, num_envs: int) -> Stepper:
-    """The batch of any library after its reset, stepped with actions of zero."""
+    """Step a batch of any library, after its reset, with actions of zero."""
     space = getattr(env, "single_action_space", env.action_space)
     action = np.zeros((num_envs, *space.shape), space.dtype)
     return Stepper(num_envs, lambda: env.step(action), env.close)
 
 
 def our_batch(num_envs: int, threads: int, resets: bool = True) -> Stepper:
-    """The native batch at random steps of its episodes; without ``resets`` it repeats the same first minutes."""
+    """Make the native batch at random steps of its episodes; without ``resets`` it repeats the same first minutes."""
     env = CzVectorEnv(num_envs, observation="measured", threads=threads)
     env.reset(seed=0)
     if not resets:
@@ -114,7 +114,7 @@ def our_batch(num_envs: int, threads: int, resets: bool = True) -> Stepper:
 
 
 def bare_plant(num_envs: int, threads: int) -> Stepper:
-    """The compiled plant and bright ring alone, without sensors, observation, reward, info or Python shell."""
+    """Make the compiled plant and bright ring alone, without sensors, observation, reward, info or Python shell."""
     batch = Batch(make_config(observation="measured"), num_envs, threads)
     rings = np.zeros(num_envs)
     batch.reset(range(num_envs), [(i, i) for i in range(num_envs)], batch.new_out())
@@ -122,7 +122,7 @@ def bare_plant(num_envs: int, threads: int) -> Stepper:
 
 
 def repeated(batch: Batch, stepper: Stepper) -> Stepper:
-    """The same stepper, whose slots go back to their present state before any crystal fails."""
+    """Return the stepper with slots that go back to their present state before any crystal fails."""
     slots, first = batch.memory.slots, batch.memory.slots.copy()
 
     def step() -> None:
@@ -134,7 +134,7 @@ def repeated(batch: Batch, stepper: Stepper) -> Stepper:
 
 
 def differentiable(derivatives: bool) -> Stepper:
-    """A batch of 256 slots that repeats the same first minutes, with derivatives at each step or without."""
+    """Make a batch of 256 slots that repeats the same first minutes, with derivatives at each step or without."""
     batch = DifferentiableBatch(make_config(), 256)
     batch.reset(range(256))
     inner, out, action = batch._batch, batch._batch.new_out(), np.zeros((256, 2))
@@ -143,14 +143,14 @@ def differentiable(derivatives: bool) -> Stepper:
 
 
 def envpool(num_envs: int, threads: int) -> Stepper:
-    """The same number of pendulums in EnvPool, whose steps are C++."""
+    """Make a batch of pendulums in EnvPool, whose steps are C++."""
     env = resolve_name("envpool:make")("Pendulum-v1", env_type="gymnasium", num_envs=num_envs, num_threads=threads)
     env.reset()
     return batched(env, num_envs)
 
 
 def measure(wanted: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, Any]:
-    """Median speeds over interleaved rounds, their ratios, and why a case was skipped: the content of the JSON file."""
+    """Measure median speeds over interleaved rounds and their ratios; reasons of skipped cases: content of the JSON."""
     from tqdm import tqdm
 
     running: dict[str, tuple[Stepper, timeit.Timer, int]] = {}
@@ -180,7 +180,7 @@ def measure(wanted: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, A
 
 
 def ratio(speeds: Mapping[str, float], row: str, over: str) -> float | None:
-    """The ratio of the fastest rows whose names begin so; None where one is missing."""
+    """Ratio of the fastest rows whose names begin so; None where one is missing."""
     above, below = (
         max((speed for name, speed in speeds.items() if name.startswith(begins)), default=None)
         for begins in (row, over)
@@ -189,7 +189,7 @@ def ratio(speeds: Mapping[str, float], row: str, over: str) -> float | None:
 
 
 def table(result: Mapping[str, Any]) -> str:
-    """The result as text."""
+    """Write the result as text."""
     lines = [f"{'':44}{'slots':>7}{'steps/s':>14}{'us/step':>10}"]
     for row in result["rows"]:
         speed = row["steps_per_s"]

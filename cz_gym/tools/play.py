@@ -60,8 +60,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return parser.run(_play, arguments, "render")
 
 
-def keys() -> dict[tuple[int, ...], Action]:
-    """The action of each combination of keys."""
+def keys_to_actions() -> dict[tuple[int, ...], Action]:
+    """Map each combination of keys to its action."""
     k, actions = load(), dict[tuple[int, ...], Action]()
     for pull, heat, large in product((0, 1, -1), (0, 1, -1), (1, 10)):
         held = {k.K_UP: pull > 0, k.K_DOWN: pull < 0, k.K_RIGHT: heat > 0, k.K_LEFT: heat < 0, k.K_LSHIFT: large > 1}
@@ -71,11 +71,10 @@ def keys() -> dict[tuple[int, ...], Action]:
 
 
 def score(config: Config, seed: int, actions: Sequence[Action], failed: bool) -> str:
-    """RMSE and return of a player's actions, and those of a controller on the same crystal, in one line.
+    """Score a player's actions beside a controller's on the same crystal: RMSE and return, in one line.
 
-    It is the paper's, and on a whole crystal its compensator along the recipe.
-
-    A run that the player left early ends there for both. A failed one counts to the horizon, as in the benchmark.
+    The controller is the paper's; on a whole crystal it is the one with the paper's compensator along the recipe. A run
+    that the player left early ends there for both. A failed one counts to the horizon, as in the benchmark.
     """
     if not failed:
         config = replace(config, horizon=len(actions) * config.control_interval)
@@ -119,7 +118,14 @@ def _play(arguments: argparse.Namespace) -> None:
 
     fps = max(1, round(arguments.speed / config.control_interval))
     env = CzEnv.from_config(config, "rgb_array", SIZE)
-    play(env, fps=fps, callback=watch, keys_to_action=keys(), seed=arguments.seed, noop=np.zeros(2, np.float32))
+    play(
+        env,
+        fps=fps,
+        callback=watch,
+        keys_to_action=keys_to_actions(),
+        seed=arguments.seed,
+        noop=np.zeros(2, np.float32),
+    )
     if actions:
         print(score(config, arguments.seed, actions, failed))
 

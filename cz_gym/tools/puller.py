@@ -1,4 +1,4 @@
-"""What a puller file implies: ``cz-gym puller FILE.toml``."""
+"""Operating point, drives and sensors that follow from a puller file: ``cz-gym puller FILE.toml``."""
 
 import argparse
 import math
@@ -17,7 +17,7 @@ from cz_gym.support.units import CELSIUS, HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 
 def implied(puller: PullerFile) -> dict[str, str]:
-    """What follows from a puller's numbers at its operating point, as texts by headings."""
+    """Describe what follows from a puller's numbers at its operating point, as texts by headings."""
     q, p, pull, power = puller.parameters, make_puller(puller.parameters), puller.pull_room, puller.power_range
     model, chain = radius_model(p), [STATES.index(name) for name in ("T_1", "T_2", "T_b")]
     lags = sorted(-1.0 / np.linalg.eigvals(linearise(p).A[np.ix_(chain, chain)]).real / MINUTE)
@@ -31,7 +31,7 @@ def implied(puller: PullerFile) -> dict[str, str]:
         "meniscus": f"{p.h_0 / MM:.3g} mm high, within {HEIGHT_MIN / MM:.3g} to {HEIGHT_MAX_IN_A * p.a / MM:.3g} mm",
         "radius": f"poles {model.poles[0]:.3g} and {model.poles[1]:.3g} rad/s in Model I at a constant melt "
         f"temperature; lost at {puller.radius_limit / MM:.3g} mm from the reference",
-        "left alone": ", ".join(f"Model {name} {_left_alone(q, mix)}" for name, mix in (("I", 1.0), ("II", 0.0))),
+        "left alone": ", ".join(f"Model {name} {_left_alone(q, lam)}" for name, lam in (("I", 1.0), ("II", 0.0))),
         "bright ring": f"{p.ring_bias / MM:.3g} mm outside the crystal, zero at {model.zero:.3g} rad/s",
         "hot zone": f"time constants {', '.join(f'{lag:.3g}' for lag in lags)} min",
         "pull speed": f"{(2.0 * q.v_0 - fastest) / MM_PER_MIN:.4g} to {fastest / MM_PER_MIN:.4g} mm/min"
@@ -43,18 +43,17 @@ def implied(puller: PullerFile) -> dict[str, str]:
     }
 
 
-def _left_alone(parameters: Parameters, mix: float) -> str:
-    """What a small error does without a controller, by the fastest pole of the plant with its melt."""
-    growth = np.linalg.eigvals(linearise(make_puller(parameters, mix)).A).real.max()
+def _left_alone(parameters: Parameters, lam: float) -> str:
+    """Say how a small error grows without a controller, by the fastest pole of the plant with its melt."""
+    growth = np.linalg.eigvals(linearise(make_puller(parameters, lam)).A).real.max()
     return f"grows to e times its size in {1.0 / growth / MINUTE:.3g} min" if growth > 0.0 else "dies out"
 
 
 def _stated(puller: PullerFile, *symbols: str) -> str:
-    """Numbers that the puller's file states, in the shown units."""
+    """Write the numbers of these symbols that the puller's file states, in the shown units."""
     text = ""
     for quantity in (MACHINE[symbol] for symbol in symbols):
-        value = value_of(puller, quantity)
-        if value is not None:
+        if (value := value_of(puller, quantity)) is not None:
             ends = dict.fromkeys(f"{end / quantity.size:g}" for end in np.atleast_1d(value))
             text += f"; {quantity.symbol.replace('_', ' ')} {' to '.join(ends)} {quantity.shown}"
     return text

@@ -27,7 +27,7 @@ def quick(monkeypatch):
 
 
 def test_keys_move_the_drives_while_they_are_held():
-    keys, p = play.keys(), make_puller()
+    keys, p = play.keys_to_actions(), make_puller()
     assert len(keys) == 17  # of three by three by two, all but none; shift alone does nothing
     env = CzEnv("nominal", action="rate", info="all")
     for pressed, pull, heat in (

@@ -1,4 +1,8 @@
-"""Report of an identification: Markdown with two pictures."""
+"""Identify a puller from its logs: ``cz-gym identify LOG.csv --puller start.toml --out my.toml``.
+
+Beside the puller file stands a report, Markdown with two pictures: the numbers that the log tells, and those it does
+not.
+"""
 
 import argparse
 from collections.abc import Sequence
@@ -11,18 +15,19 @@ from cz_gym.episodes.scenario import to_csv
 from cz_gym.evaluation.plots import COLOURS, GREY, INK, canvas, png
 from cz_gym.physics.parameters import describe
 from cz_gym.physics.plant import make_puller
-from cz_gym.puller.file import find_puller, to_toml
+from cz_gym.puller.file import PullerFile, find_puller, to_toml
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import check_writable, write_files
 from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN, PERCENT
 from cz_gym.tools.report.tables import markdown
 
-from .estimate import COLOURED, Estimate, Identified, coloured, identify
+from .estimate import COLOURED, SENSORS, Estimate, Identified, coloured, identify
 from .log import COLUMNS, Log, check_puller, column_map, read_log
 from .model import Lags
 
-SENSORS = "pyrometer", "ring"
+NO_FIT = 3
+"""Exit code where the model does not fit the log."""
 CALLIPER = 0.05 * MM
 """Error of a calliper's reading of the radius [m]."""
 OTHERS = {
@@ -41,7 +46,7 @@ HEADS = "number", "unit", "start", "log", "95 % interval", "uncertainty left [%]
 
 
 def report(identified: Identified, log: Log | Sequence[Log], source: str, path: Path) -> dict[Path, bytes]:
-    """The files of a report, its text at ``path``: what the log ``source`` tells of a puller, and what it does not."""
+    """Write a report on the log named ``source``; return its files, the text at ``path``."""
     readings, numbers = (path.with_name(f"{path.stem}-{name}.png") for name in ("readings", "numbers"))
     told = sum(e.informed for e in identified.estimates)
     moves = zip(("pull speed", "heater"), identified.excitation, strict=True)
@@ -105,7 +110,7 @@ def _moved(share: float) -> str:
 
 
 def _calliper(identified: Identified) -> str:
-    """What the ring's offset would say of phi_b if the crystal's radius were known."""
+    """Say how well phi_b would be known from the ring's offset and a calliper reading of the crystal."""
     parameters = (identified.start if identified.misfits else identified.puller).parameters
     log, step = identified.log, 1e-4
     ring = make_puller(parameters).ring_bias
@@ -121,7 +126,7 @@ def _calliper(identified: Identified) -> str:
 
 
 def _readings(identified: Identified) -> bytes:
-    """Drives, readings with their predictions, and prediction errors, as PNG."""
+    """Draw drives, readings with their predictions, and prediction errors, as PNG."""
     figure, log, hours = canvas(8.0, 8.0), identified.log, identified.log.time / HOUR
     drives, ring, pyrometer, errors = figure.subplots(4, 1, sharex=True)
     drives.plot(hours, log.v_p / MM_PER_MIN, color=COLOURS[1], lw=0.8, label="pull speed [mm/min]")
@@ -145,7 +150,7 @@ def _readings(identified: Identified) -> bytes:
 
 
 def _numbers(identified: Identified) -> bytes:
-    """Start and estimates with their 95 % intervals, relative to the start, as PNG."""
+    """Draw start and estimates with their 95 % intervals, relative to the start, as PNG."""
     figure = canvas(7.0, 4.5)
     axis = figure.subplots()
     shown = [e for e in identified.estimates if e.name not in Lags._fields]
@@ -158,12 +163,6 @@ def _numbers(identified: Identified) -> bytes:
     axis.invert_yaxis()
     axis.set_xlabel("estimate / start [-]; grey: this log says nothing about it")
     return png(figure)
-
-
-# Identify a puller from its logs: ``cz-gym identify LOG.csv --puller start.toml --out my.toml``.
-
-NO_FIT = 3
-"""Exit code where the model does not fit the log."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -183,17 +182,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return parser.run(_main, arguments, "plant")
 
 
-def _main(given: argparse.Namespace) -> int:
-    pass
-
+def _check_outputs(given: argparse.Namespace, start: PullerFile) -> None:
+    """Raise CzError for names of output files that cannot or must not be written."""
     for option, path, suffix in (("--out", given.out, ".toml"), ("--series", given.series, ".csv")):
         if path is not None and path.suffix != suffix:
             raise CzError(f"{option} must be a file NAME{suffix}, not {path}")
         if path is not None:
             check_writable(path.absolute().parent)
-    start = find_puller(given.puller)
     if start.file is not None and given.out.exists() and given.out.samefile(start.file):
         raise CzError(f"--out {given.out} is the file to start from: name another one")
+
+
+def _main(given: argparse.Namespace) -> int:
+    start = find_puller(given.puller)
+    _check_outputs(given, start)
     logs = [read_log(path, column_map(given.column, given.columns)) for path in given.log]
     for path, log in zip(given.log, logs, strict=True):
         check_puller(log, start, str(path))

@@ -1,4 +1,7 @@
-"""Whether a model fits a log: what its prediction errors, its operating point and its noise say."""
+"""Maximum a posteriori of the filter's prediction errors: what a log tells of a puller, and whether the model fits.
+
+Prediction errors, operating point and noise at the maximum say whether the model fits the log.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,81 +18,12 @@ from cz_gym.support.errors import CzError
 from cz_gym.support.names import unknown_name_message
 from cz_gym.support.units import KILO, MM
 
-from .log import Floats, Log, join, prepare, shift_drives
-from .model import FAST, LAM, LOAD, SLOW, Lags, Model, Noise, Predicted, sensitivities, smooth
+from .log import Floats, Log, join_logs, prepare, shift_drives
+from .model import FAST, LAM, LOAD, SLOW, Lags, Model, NoiseLevels, Predicted, sensitivities, smooth
 from .moves import measure_excitation
 
-ROWS_BACK, COLOURED = 20, 0.15
-"""Lags at which prediction errors are correlated [rows], and the correlation above which the model does not fit [-];
-many rows make smaller ones significant."""
-SEEN = 0.05, 0.01 * MM
-"""Least standard deviation of prediction errors of pyrometer [K] and ring [m] that are judged: no sensor shows less,
-and a model need not be better."""
-FAR = 3.0
-"""Standard deviations of its prior from which on an estimate stands at its end."""
-T_1_OFF, Q_H_OFF = 15.0, 0.06
-"""Largest differences of the model's operating point and the log's means: T_1 [K], share of the power [-]."""
-NOISY = 2.5
-"""Largest ratio of a sensor's noise to what the start file says."""
-
-
-def misfits(identified: Any, puller: Any, away: Mapping[str, float]) -> tuple[str, ...]:
-    """Reasons why the model does not fit the log, in words.
-
-    ``identified`` is an :class:`.estimate.Identified`, ``puller`` its puller with Q_H_0 and T_1_0, ``away`` how far
-    each estimate is from its prior's mean, in standard deviations. Only paths that were estimated are judged; a delay
-    or a noise may well be absent.
-    """
-    pull, heater = (share >= 1.0 for share in identified.excitation)
-    if not (pull or heater):
-        return ()
-    judged = ((0, "pyrometer", heater), (1, "ring", True))
-    reasons = [] if identified.settled else ["the search has not settled"]
-    for sensor, name, estimated in judged:
-        seen = np.nanstd(identified.predicted.error[:, sensor]) > SEEN[sensor]
-        if estimated and seen and (size := coloured(identified.errors[:, sensor])) > COLOURED:
-            reasons.append(f"prediction errors of the {name} are coloured (correlation {size:.2f})")
-    if heater:
-        T_1, Q_H = np.nanmean(identified.log.T_1), np.mean(identified.log.Q_H)
-        if abs(puller.T_1_0.real - T_1) > T_1_OFF:
-            reasons.append(f"its T_1 is {puller.T_1_0.real:.0f} K where the log's mean is {T_1:.0f} K")
-        if abs(puller.Q_H_0.real / Q_H - 1.0) > Q_H_OFF:
-            reasons.append(f"it needs {puller.Q_H_0.real / KILO:.1f} kW where the log's mean is {Q_H / KILO:.1f} kW")
-    parameters = {e.name for e in identified.estimates} - set(Lags._fields)
-    ends = [f"{name} ({by:+.1f})" for name, by in away.items() if (abs(by) if name in parameters else by) > FAR]
-    if ends:
-        reasons.append(f"estimates stand at the ends of their priors [standard deviations]: {', '.join(ends)}")
-    noise, sensors = {e.name: e.value for e in identified.noise}, identified.start
-    ring = np.hypot(max(sensors.camera_noise or (0.0,)), max(sensors.ripple or (0.0,)))
-    for name, value, usual, unit, size in (
-        ("ring", noise["camera_sd"], ring, "mm", MM),
-        ("pyrometer", noise["pyrometer_sd"], max(sensors.pyrometer_noise or (0.0,)), "K", 1.0),
-    ):
-        if usual and value > NOISY * usual:
-            reasons.append(f"noise of the {name} is {value / size:.2g} {unit}, the file says {usual / size:.2g} {unit}")
-    try:
-        _ = identified.puller
-    except CzError as error:
-        reasons.append(f"its numbers are not plausible: {error}")
-    return tuple(reasons)
-
-
-def coloured(errors: Floats) -> float:
-    """Largest correlation of errors within LAGS rows [-], without their strongest line, which may be the rotation's.
-
-    Errors are NaN where nothing was read.
-    """
-    u = np.nan_to_num(errors - np.nanmean(errors))
-    spectrum = np.fft.rfft(u)
-    peak = int(np.abs(spectrum).argmax())
-    spectrum[max(peak - 1, 0) : peak + 2] = 0.0
-    u = np.fft.irfft(spectrum, len(u))
-    u -= u.mean()
-    return float(max(abs(u[lag:] @ u[:-lag]) for lag in range(1, ROWS_BACK + 1)) / (u @ u))
-
-
-# Maximum a posteriori of the filter's prediction errors: what a log tells of a puller, and what it does not.
-
+SENSORS = "pyrometer", "ring"
+"""Sensors in the order of prediction errors."""
 HEATER = ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b", "eps", "k_l")
 """Parameters of the path from the heater."""
 PULL = ("sigma", "lam")
@@ -115,7 +49,7 @@ CAUTIOUS = {"pyrometer_sd": 20.0, "camera_sd": 4.0}
 
 
 class Estimate(NamedTuple):
-    """What a log says of one number, SI units; of ``lam``, the product lam dT_0 [K]."""
+    """Estimate of one number from a log, SI units; of ``lam``, the product lam dT_0 [K]."""
 
     name: str
     prior: float
@@ -126,25 +60,25 @@ class Estimate(NamedTuple):
     left: float
     """Share of the prior's standard deviation that is left [-]."""
     excited: bool = True
-    """Whether its drive moved enough; without that it is not estimated."""
+    """True if its drive moved enough; without that it is not estimated."""
     trusted: bool = True
-    """Whether the model fits the log; of a lag, whether they add up to more than half a row."""
+    """True if the model fits the log; for a lag, if the lags add up to more than half a row too."""
 
     @property
     def informed(self) -> bool:
-        """Whether the log says enough for the value to be used."""
+        """True if the log says enough for the value to be used."""
         return self.trusted and self.left < INFORMED
 
 
 @dataclass(frozen=True)
 class Identified:
-    """The result of an identification."""
+    """Result of an identification."""
 
     start: PullerFile
     estimates: tuple[Estimate, ...]
     """Estimates of the numbers in HEATER, LAGS and PULL."""
     noise: tuple[Estimate, ...]
-    """Estimates of the numbers in :class:`Noise`."""
+    """Estimates of the numbers in :class:`NoiseLevels`."""
     excitation: tuple[float, float]
     """Moves of pull speed and heater that no reading explains, in multiples of what is needed [-]."""
     errors: Floats
@@ -153,22 +87,22 @@ class Identified:
     logs: tuple[Log, ...]
     """The logs in the rows that were estimated from."""
     settled: bool
-    """Whether the search has ended at a maximum."""
+    """True if the search has ended at a maximum."""
     misfits: tuple[str, ...] = ()
-    """Why the model does not fit the log, in words; empty if it does."""
+    """Reasons why the model does not fit the log, in words; empty if it does."""
 
     @property
     def log(self) -> Log:
         """The logs one after the other."""
-        return join(self.logs)
+        return join_logs(self.logs)
 
     def series(self, meniscus: MeniscusModel = HURLE) -> list[tuple[Floats, Floats, Floats]]:
-        """Times [s], load on the melt [W] and fluctuation of the interface [K] of each log.
+        """Times [s], load on the melt [W] and fluctuation of the interface [K] of each log, from a smoother.
 
-        They are those that a smoother gives for :attr:`puller`, so that its crystal grows as the log's did.
+        With them a crystal of :attr:`puller` grows as the log's did.
         """
         lags = _lags_of(self.puller, False)
-        model = Model(Noise._fields, self.puller.parameters, meniscus, lags)
+        model = Model(NoiseLevels._fields, self.puller.parameters, meniscus, lags)
         theta = np.array([np.log(each.value / each.prior) for each in self.noise])
         states = [smooth(log, model, theta) for log in self.logs]
         pairs = zip(self.logs, states, strict=True)
@@ -176,10 +110,10 @@ class Identified:
 
     @property
     def puller(self) -> PullerFile:
-        """The start with the numbers that the log tells: parameters, lags, and the noise of camera and pyrometer.
+        """Start file with the numbers that the log tells: parameters, lags, and the noise of camera and pyrometer.
 
-        ``lam`` is none of them: each crystal of a scenario draws its own. Where the model does not fit, the numbers are
-        what explains the log best all the same.
+        ``lam`` is not among them: each crystal of a scenario draws its own. Where the model does not fit, the numbers
+        are the ones that explain the log best.
         """
         sure = {e.name: e.value for e in (*self.estimates, *self.noise) if e.left < INFORMED}
         names = {"camera_sd": "camera_noise", "pyrometer_sd": "pyrometer_noise"}
@@ -191,7 +125,7 @@ class Identified:
 
     @property
     def verdict(self) -> str:
-        """One line: whether the model fits the log, or why it does not."""
+        """One line that says that the model fits the log, or why it does not."""
         if self.misfits:
             return f"THE MODEL DOES NOT FIT: {'; '.join(self.misfits)}"
         moved = [drive for drive, share in zip(("pull speed", "heater"), self.excitation, strict=True) if share >= 1.0]
@@ -199,7 +133,7 @@ class Identified:
 
     @property
     def delayed(self) -> bool:
-        """Whether the heater's path has a delay that the model's equations do not have."""
+        """True if the heater's path has a delay that the model's equations do not have."""
         return any(e.trusted for e in self.estimates if e.name in LAGS and e.excited)
 
 
@@ -218,7 +152,7 @@ def identify(
     sds = _prior_sds(prior_sd or {})
     pull, heater = measure_excitation(logs, start)
     free = (*((*HEATER, *LAGS) if heater >= 1.0 else ()), *(PULL if pull >= 1.0 else ()))
-    model = Model((*free, *Noise._fields), start.parameters, meniscus, _lags_of(start, heater >= 1.0))
+    model = Model((*free, *NoiseLevels._fields), start.parameters, meniscus, _lags_of(start, heater >= 1.0))
     sd, latency = np.array([sds[name] for name in model.names]), start.latency or 0.0
     rows = [prepare(each, latency) for each in logs]
     best = _maximise(rows, model, sd)
@@ -236,10 +170,10 @@ def identify(
         delay = name not in LAGS or np.subtract(*(_delay(best, model) * (1.0, 2.0))) > 0.5 * logs[0].interval
         return Estimate(name, usual, value, low, high, best.sd[j] / sd[j], trusted=bool(delay))
 
-    whole = join(rows)
+    whole = join_logs(rows)
     read = np.isfinite([whole.T_1, whole.ring]).T
     errors = np.where(read, best.out.error / np.sqrt(best.out.variance), np.nan)
-    told, noise = tuple(map(estimate, (*HEATER, *LAGS, *PULL))), tuple(map(estimate, Noise._fields))
+    told, noise = tuple(map(estimate, (*HEATER, *LAGS, *PULL))), tuple(map(estimate, NoiseLevels._fields))
     result = Identified(start, told, noise, (pull, heater), errors, best.out, tuple(rows), best.settled)
     away = dict(zip(model.names, (best.theta - model.mean) / sd, strict=True))
     if reasons := misfits(result, model.puller(best.theta + 0j), away):
@@ -248,7 +182,7 @@ def identify(
 
 
 def _prior_sds(given: Mapping[str, float]) -> dict[str, float]:
-    sds = dict.fromkeys((*HEATER, *PULL), PRIOR_SD) | dict.fromkeys(Noise._fields, NOISE_SD) | {"lam": LAM_SD}
+    sds = dict.fromkeys((*HEATER, *PULL), PRIOR_SD) | dict.fromkeys(NoiseLevels._fields, NOISE_SD) | {"lam": LAM_SD}
     sds |= {"heater_lag": LAG_SD, "pyrometer_filter": LAG_SD, "heater_dead_time": DEAD_SD}
     for name, value in given.items():
         if name not in sds or not 0.0 < value < np.inf:
@@ -260,13 +194,13 @@ def _prior_sds(given: Mapping[str, float]) -> dict[str, float]:
 
 
 def _lags_of(start: PullerFile, free: bool) -> Lags:
-    """The start's lags; where they are estimated, a short one in place of none."""
+    """Lags of the start file; where they are estimated, a short one in place of none."""
     lag, dead, slow = (float(np.mean(getattr(start, name) or 0.0)) for name in LAGS)
     return Lags(lag or SHORT * free, dead, slow or SHORT * free)
 
 
 class Maximum(NamedTuple):
-    """The posterior's maximum."""
+    """Maximum of the posterior."""
 
     theta: Floats
     """Free numbers."""
@@ -291,7 +225,7 @@ def _delay(best: Maximum, model: Model) -> Floats:
 
 
 def _maximise(logs: Sequence[Log], model: Model, sd: Floats) -> Maximum:
-    """The posterior's maximum, where the search ends or began if the filter cannot follow the log.
+    """Search the posterior's maximum; the start of the search if the filter cannot follow the log there.
 
     The curvature is Fisher's information of Gaussian prediction errors, so no second derivatives are needed.
     """
@@ -331,7 +265,7 @@ def _maximise(logs: Sequence[Log], model: Model, sd: Floats) -> Maximum:
 
 
 def _plausible_start(logs: Sequence[Log], model: Model, sd: Floats) -> Floats:
-    """A start in prior standard deviations: its operating point has the log's mean temperature and power, nearly."""
+    """Start of the search, in prior standard deviations: its operating point is near the log's mean T_1 and power."""
     away = np.zeros(len(sd))
     for name, factor in CAUTIOUS.items():
         j = model.names.index(name)
@@ -346,3 +280,85 @@ def _plausible_start(logs: Sequence[Log], model: Model, sd: Floats) -> Floats:
 
     start: Floats = least_squares(misfit, away).x
     return start
+
+
+# Reasons against the model.
+
+ROWS_BACK, COLOURED = 20, 0.15
+"""Lags at which prediction errors are correlated [rows], and the correlation above which the model does not fit [-];
+many rows make smaller ones significant."""
+LEAST_ERROR = 0.05, 0.01 * MM
+"""Least standard deviation of prediction errors of pyrometer [K] and ring [m] that are judged: no sensor shows less,
+and a model need not be better."""
+PRIOR_END = 3.0
+"""Standard deviations of its prior from which on an estimate stands at its end."""
+T_1_OFF, Q_H_OFF = 15.0, 0.06
+"""Largest differences of the model's operating point and the log's means: T_1 [K], share of the power [-]."""
+NOISE_RATIO = 2.5
+"""Largest ratio of a sensor's noise to what the start file says."""
+
+
+def misfits(identified: Identified, puller: Any, away: Mapping[str, float]) -> tuple[str, ...]:
+    """List the reasons why the model does not fit the log, in words.
+
+    ``puller`` has the estimates' Q_H_0 and T_1_0, ``away`` how far each estimate is from its prior's mean, in standard
+    deviations. Only paths that were estimated are judged; a delay or a noise may well be absent.
+    """
+    heater = identified.excitation[1] >= 1.0
+    if not heater and identified.excitation[0] < 1.0:
+        return ()
+    reasons = [] if identified.settled else ["the search has not settled"]
+    for sensor, name in enumerate(SENSORS):
+        large = np.nanstd(identified.predicted.error[:, sensor]) > LEAST_ERROR[sensor]
+        if (heater or name == "ring") and large and (size := coloured(identified.errors[:, sensor])) > COLOURED:
+            reasons.append(f"prediction errors of the {name} are coloured (correlation {size:.2f})")
+    if heater:
+        reasons += _off_the_operating_point(identified.log, puller)
+    parameters = {e.name for e in identified.estimates} - set(LAGS)
+    ends = [f"{name} ({by:+.1f})" for name, by in away.items() if (abs(by) if name in parameters else by) > PRIOR_END]
+    if ends:
+        reasons.append(f"estimates stand at the ends of their priors [standard deviations]: {', '.join(ends)}")
+    reasons += _noisy_sensors(identified)
+    try:
+        _ = identified.puller
+    except CzError as error:
+        reasons.append(f"its numbers are not plausible: {error}")
+    return tuple(reasons)
+
+
+def _off_the_operating_point(log: Log, puller: Any) -> list[str]:
+    """Compare the model's temperature and power at rest with the log's means."""
+    reasons, T_1, Q_H = [], np.nanmean(log.T_1), np.mean(log.Q_H)
+    if abs(puller.T_1_0.real - T_1) > T_1_OFF:
+        reasons.append(f"its T_1 is {puller.T_1_0.real:.0f} K where the log's mean is {T_1:.0f} K")
+    if abs(puller.Q_H_0.real / Q_H - 1.0) > Q_H_OFF:
+        reasons.append(f"it needs {puller.Q_H_0.real / KILO:.1f} kW where the log's mean is {Q_H / KILO:.1f} kW")
+    return reasons
+
+
+def _noisy_sensors(identified: Identified) -> list[str]:
+    """Compare the sensors' noise with what the start file says."""
+    noise, file = {e.name: e.value for e in identified.noise}, identified.start
+    ring = np.hypot(max(file.camera_noise or (0.0,)), max(file.ripple or (0.0,)))
+    return [
+        f"noise of the {name} is {value / size:.2g} {unit}, the file says {usual / size:.2g} {unit}"
+        for name, value, usual, unit, size in (
+            ("ring", noise["camera_sd"], ring, "mm", MM),
+            ("pyrometer", noise["pyrometer_sd"], max(file.pyrometer_noise or (0.0,)), "K", 1.0),
+        )
+        if usual and value > NOISE_RATIO * usual
+    ]
+
+
+def coloured(errors: Floats) -> float:
+    """Largest correlation of errors within ROWS_BACK rows [-], without their strongest line, perhaps the rotation's.
+
+    Errors are NaN where nothing was read.
+    """
+    u = np.nan_to_num(errors - np.nanmean(errors))
+    spectrum = np.fft.rfft(u)
+    peak = int(np.abs(spectrum).argmax())
+    spectrum[max(peak - 1, 0) : peak + 2] = 0.0
+    u = np.fft.irfft(spectrum, len(u))
+    u -= u.mean()
+    return float(max(abs(u[lag:] @ u[:-lag]) for lag in range(1, ROWS_BACK + 1)) / (u @ u))

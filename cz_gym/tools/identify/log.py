@@ -1,4 +1,8 @@
-"""Fields of a CSV or Parquet file: their encoding, separators, decimal signs and times, and the units of a log."""
+"""Log of a puller: read from CSV or Parquet with any names and units, put on a regular grid, written.
+
+Fields are read as text, because a line about a wrong one names its row and column as the file has them; pandas' own
+conversion of a column would tell neither. The grid follows the times of the rows slowly, as a clock drifts.
+"""
 
 import csv
 import io
@@ -52,8 +56,11 @@ TOP = 100
 """Lines of a file among which its columns are named."""
 
 
-def text_table(path: Path, wanted: set[str]) -> tuple[Any, int]:
-    """A file's fields as text, and the line of its first row."""
+def read_fields(path: Path, wanted: set[str]) -> tuple[Any, int]:
+    """Read a file's fields as text, and the line of its first row; the line above names most of the ``wanted`` columns.
+
+    CzError for a file that is no table.
+    """
     import pandas
 
     try:
@@ -91,8 +98,8 @@ def _fields(line: str, separator: str) -> list[str]:
     return [field.strip() for field in next(csv.reader([line], delimiter=separator), [])]
 
 
-def times(column: Any, unit: str, line: int, notes: dict[str, int]) -> tuple[Any, int]:
-    """Times [s] of the rows from the first to the last one that has a time, and the number of rows before."""
+def parse_times(column: Any, unit: str, line: int, notes: dict[str, int]) -> tuple[Any, int]:
+    """Parse times [s] from the first to the last row that has one, and count the rows before; CzError names a row."""
     text = column.fillna("").str.strip()
     times, absent = _read_times(text, unit), text.str.lower().isin(ABSENT)
     good = np.flatnonzero(times.notna())
@@ -118,7 +125,7 @@ def times(column: Any, unit: str, line: int, notes: dict[str, int]) -> tuple[Any
 
 
 def _read_times(text: Any, unit: str) -> Any:
-    """Times [s]; NaN where a field is none."""
+    """Parse times [s]; NaN where a field is none."""
     import pandas
 
     factor, _ = TIME[unit]
@@ -127,15 +134,15 @@ def _read_times(text: Any, unit: str) -> Any:
         only = whole.where(whole.str.match(r"\d+:\d+:\d+(\.\d+)?$"))
         return pandas.to_timedelta(only, errors="coerce").dt.total_seconds()
     if unit not in DATED:
-        return pandas.to_numeric(_plain(text), errors="coerce").astype(float) * factor
+        return pandas.to_numeric(_plain_numbers(text), errors="coerce").astype(float) * factor
     plain = text.where(text.str.contains(r"\d[-./]\d")).str.replace(r",(\d+)$", r".\1", regex=True)
     how: Any = {"format": "ISO8601"} if unit == "iso" else {"format": "mixed", "dayfirst": unit == "dmy"}
     times = pandas.to_datetime(plain, utc=True, errors="coerce", **how)
     return (times - pandas.Timestamp(0, tz="utc")).dt.total_seconds()
 
 
-def _plain(text: Any) -> Any:
-    """Numbers with a decimal point and nothing between thousands; where a field has both signs, the last is decimal."""
+def _plain_numbers(text: Any) -> Any:
+    """Write numbers with a decimal point and nothing between thousands; of two signs in a field the last is decimal."""
     text = text.str.replace(r"(?<=\d)[\s'](?=\d)", "", regex=True)
     both = text.str.extract(r"([.,]).*([.,])")
     both = both[both[0] != both[1]].dropna()
@@ -144,13 +151,13 @@ def _plain(text: Any) -> Any:
     return text.str.replace(",", ".", regex=False).replace({"True": "1", "False": "0"})
 
 
-def numbers(column: Any, line: int) -> Any:
-    """A column's numbers; an absent one is NaN."""
+def parse_numbers(column: Any, line: int) -> Any:
+    """Parse a column's numbers; an absent one is NaN. CzError names the row of a field that is none."""
     import pandas
 
     text = column.fillna("").str.strip()
     absent = text.str.lower().isin(ABSENT)
-    numbers = pandas.to_numeric(_plain(text).mask(absent), errors="coerce").astype(float)
+    numbers = pandas.to_numeric(_plain_numbers(text).mask(absent), errors="coerce").astype(float)
     wrong = numbers.isna() & ~absent
     if wrong.any():
         row = wrong.idxmax()
@@ -158,7 +165,7 @@ def numbers(column: Any, line: int) -> Any:
     return numbers
 
 
-# A log on a regular grid: rows at equal times, without outliers, and what was left out or filled.
+# Rows at equal times, without outliers; notes of what was left out or filled.
 
 Floats = npt.NDArray[np.float64]
 SHORTEST, FEWEST = 30.0 * MINUTE, 200
@@ -212,7 +219,9 @@ class Log(NamedTuple):
 
 
 def sound_rows(table: Any, line: int, notes: dict[str, int]) -> Any:
-    """Rows from the first one with both drives, one a time; CzError for times that go back, and too short a log."""
+    """Select the rows from the first one with both drives on, one a time; CzError for times that go back, and for too
+    short a log.
+    """
     time = table["time_s"].to_numpy()
     back = np.diff(time) < 0.0
     if back.any():
@@ -236,8 +245,7 @@ def sound_rows(table: Any, line: int, notes: dict[str, int]) -> Any:
 
 
 def _slots(time: Floats, interval: float) -> npt.NDArray[np.int64]:
-    """Number of the grid's row that each time belongs to; the grid follows the times slowly, so that jitter does not
-    matter."""
+    """Find the row of the grid that each time belongs to; the grid follows the times slowly: jitter does not matter."""
     phases = np.exp(2j * np.pi * (time[:50] - time[0]) / interval)
     slots, at = np.zeros(len(time), np.int64), time[0] + interval * np.angle(phases.mean()) / (2.0 * np.pi)
     for k in range(1, len(time)):
@@ -248,7 +256,7 @@ def _slots(time: Floats, interval: float) -> npt.NDArray[np.int64]:
 
 
 def on_grid(table: Any, notes: dict[str, int]) -> Log:
-    """The table's rows at equal times, and what was left out or filled."""
+    """Put the table's rows at equal times; add to the notes what was left out or filled."""
     time = table["time_s"].to_numpy()
     steps = np.diff(time)
     interval = float(steps[np.abs(steps / np.median(steps) - 1.0) <= 0.5].mean())
@@ -265,19 +273,7 @@ def on_grid(table: Any, notes: dict[str, int]) -> Log:
     notes["rows repeat a time"] += len(time) - len(present)
     notes["rows are missing"] = n - len(present)
     grid = table[last].set_axis(present).reindex(range(n))
-    invalid = grid["ring_radius_mm"].notna() & (grid["valid"] < 0.5)
-    notes["readings of the ring are not valid"] = int(invalid.sum())
-    grid["ring_radius_mm"] = grid["ring_radius_mm"].mask(invalid)
-    for name in OUTLIERS:
-        outlier = _outliers(grid[name], name)
-        notes[f"readings of {name} are outliers"] = int(outlier.sum())
-        grid[name] = grid[name].mask(outlier)
-        notes[f"readings of {name} are missing"] = int(grid[name][present].isna().sum() - outlier.sum())
-        if grid[name].count() < 0.3 * n:
-            raise CzError(f"{name} has only {grid[name].count()} good readings in {n} rows")
-        if name not in DRIVES and grid[name].min() == grid[name].max():
-            raise CzError(f"{name} is constant, so it tells nothing")
-    notes["readings of ring_radius_mm are missing"] -= notes["readings of the ring are not valid"]
+    _drop_bad_readings(grid, present, notes)
     after_gap = present[1:][np.diff(present) * interval > LONG_GAP]
     notes[f"gaps are longer than {LONG_GAP:g} s"] = len(after_gap)
     filled = grid[list(DRIVES)].interpolate(limit_direction="both")
@@ -290,7 +286,25 @@ def on_grid(table: Any, notes: dict[str, int]) -> Log:
     return Log._make([interval * np.arange(n, dtype=np.float64), *readings, gap, unsure, interval, said, 1])
 
 
+def _drop_bad_readings(grid: Any, present: npt.NDArray[np.int64], notes: dict[str, int]) -> None:
+    """Make readings that are not valid, and outliers, NaN; CzError for a column with few or equal readings."""
+    invalid = grid["ring_radius_mm"].notna() & (grid["valid"] < 0.5)
+    notes["readings of the ring are not valid"] = int(invalid.sum())
+    grid["ring_radius_mm"] = grid["ring_radius_mm"].mask(invalid)
+    for name in OUTLIERS:
+        outlier = _outliers(grid[name], name)
+        notes[f"readings of {name} are outliers"] = int(outlier.sum())
+        grid[name] = grid[name].mask(outlier)
+        notes[f"readings of {name} are missing"] = int(grid[name][present].isna().sum() - outlier.sum())
+        if grid[name].count() < 0.3 * len(grid):
+            raise CzError(f"{name} has only {grid[name].count()} good readings in {len(grid)} rows")
+        if name not in DRIVES and grid[name].min() == grid[name].max():
+            raise CzError(f"{name} is constant, so it tells nothing")
+    notes["readings of ring_radius_mm are missing"] -= notes["readings of the ring are not valid"]
+
+
 def _outliers(values: Any, name: str) -> Any:
+    """Find readings that Hampel's filter of their column, or a factor of :data:`ABSURD`, refuses."""
     neighbours, deviations, least, share = OUTLIERS[name]
     middle = abs(values.median())
     absurd = ((values < middle / ABSURD) | (values > middle * ABSURD)) & (name not in DRIVES)
@@ -300,9 +314,8 @@ def _outliers(values: Any, name: str) -> Any:
 
 
 def _unsure(values: Any, filled: Floats) -> Floats:
-    """Standard deviation of a drive where it was filled: half of its usual move in as many rows.
-
-    It is larger by the root of their number, because their errors are alike.
+    """Standard deviation of a drive where it was filled, else 0: half of its usual move in as many rows, larger by the
+    root of their number, because their errors are alike.
     """
     absent = values.isna()
     lengths = absent.groupby((~absent).cumsum()).transform("sum").to_numpy() * absent.to_numpy()
@@ -311,7 +324,7 @@ def _unsure(values: Any, filled: Floats) -> Floats:
 
 
 def prepare(log: Log, latency: float = 0.0) -> Log:
-    """The log with the ring at the time of its frames, ``latency`` [s] before, and thinned to rows of about THIN [s].
+    """Put the ring at the time of its frames, ``latency`` [s] before, and thin the log to rows of about THIN [s].
 
     Readings are means of the rows around a time, drives of those since the row before: neither is late.
     """
@@ -333,27 +346,27 @@ def prepare(log: Log, latency: float = 0.0) -> Log:
 
 
 def shift_drives(log: Log) -> Log:
-    """The log with its drives a row later."""
+    """Move a log's drives by a row, to later times."""
     v_p, Q_H = (np.append(drive[:1], drive[:-1]) for drive in (log.v_p, log.Q_H))
     return log._replace(v_p=v_p, Q_H=Q_H, notes=(*log.notes, "a row's drives act after it: they were moved by a row"))
 
 
-def join(logs: Sequence[Log]) -> Log:
-    """Logs one after the other, for pictures."""
+def join_logs(logs: Sequence[Log]) -> Log:
+    """Join logs one after the other, for pictures."""
     ends = np.cumsum([0.0, *(log.time[-1] + log.interval for log in logs)])
     logs = [log._replace(time=log.time + end) for log, end in zip(logs, ends, strict=False)]
     arrays: list[Any] = [np.concatenate([getattr(log, name) for log in logs]) for name in Log._fields[:9]]
     return Log._make([*arrays, logs[0].interval, tuple(note for log in logs for note in log.notes), 1])
 
 
-# Logs of a puller: read from CSV or Parquet with any names and units, and written.
+# Logs as files.
 
 BODY, CONE = 0.15, 0.02
 """Largest deviation of the ring in a body, in radii, and the share of rows beyond it that a cone has at least."""
 
 
 def column_map(given: Sequence[str], file: Path | None = None) -> dict[str, tuple[str, str]]:
-    """Names and units of a log's columns, by standard name, from ``NAME=COLUMN[:UNIT]`` and a TOML file.
+    """Map standard names of a log's columns to the file's and their units, by ``NAME=COLUMN[:UNIT]`` and a TOML file.
 
     The file holds ``NAME = "COLUMN:UNIT"``. Raises CzError for names and units that there are not.
     """
@@ -392,7 +405,7 @@ def read_log(path: str | Path, columns: Mapping[str, tuple[str, str]] | None = N
     named = {name: (name, next(iter(units))) for name, units in COLUMNS.items()} | dict(columns or {})
     try:
         with name_file_in_errors(path):
-            file, line = text_table(Path(path), {column for column, _ in named.values()})
+            file, line = read_fields(Path(path), {column for column, _ in named.values()})
         if (time := named["time_s"][0]) not in file and set(parts := time.split("+")) <= set(file):
             file[time] = file[parts].fillna("").agg(" ".join, axis=1)
         for name in (*REQUIRED, *(columns or {})):
@@ -406,11 +419,11 @@ def read_log(path: str | Path, columns: Mapping[str, tuple[str, str]] | None = N
             if isinstance(file[column], pandas.DataFrame):
                 raise CzError(f"two columns are called {column!r}: give one of them another name")
         notes, unit = dict[str, int](), present["time_s"][1]
-        seconds, first = times(file[time], unit, line, notes)
+        seconds, first = parse_times(file[time], unit, line, notes)
         table = pandas.DataFrame(index=seconds.index, columns=list(COLUMNS), dtype=float).assign(time_s=seconds)
         for name, (column, unit) in list(present.items())[1:]:
             factor, added = COLUMNS[name][unit]
-            table[name] = numbers(file[column][seconds.index], line) * factor + added
+            table[name] = parse_numbers(file[column][seconds.index], line) * factor + added
         infinite = np.isinf(table.to_numpy()).sum()
         notes["numbers are infinite"] = int(infinite)
         return on_grid(sound_rows(table.replace([np.inf, -np.inf], np.nan), line + first, notes), notes)

@@ -36,7 +36,7 @@ QUICKEST = 1e-6
 _STEP, _SHARE = 1e-30, 1e-6
 
 
-class Noise(NamedTuple):
+class NoiseLevels(NamedTuple):
     """Strength of the disturbances and of the sensors' noise."""
 
     camera_sd: Any = 0.025 * MM
@@ -52,7 +52,7 @@ class Noise(NamedTuple):
 
 
 class Lags(NamedTuple):
-    """What delays the heater's path."""
+    """Delays of the heater's path."""
 
     heater_lag: Any = 0.0
     """Time constant with which the power that heats follows the log's [s]."""
@@ -139,39 +139,40 @@ def build_filter(meniscus: MeniscusModel) -> Any:
 
 
 class Model(NamedTuple):
-    """The map from free numbers to a puller, its lags and its noise: logarithms of factors, ``lam`` and the heater's
-    dead time themselves.
+    """Map from free numbers to a puller, its lags and its noise.
+
+    Free numbers are logarithms of factors on the start's numbers, but ``lam`` and the heater's dead time themselves.
     """
 
     names: tuple[str, ...]
-    """The free ones, of Parameters, Lags, Noise and ``lam``."""
+    """Names of the free numbers, of Parameters, Lags, NoiseLevels and ``lam``."""
     start: Parameters
     meniscus: MeniscusModel = HURLE
     lags: Lags = Lags()
-    """The start's; factors refer to them."""
+    """Lags of the start, which the factors refer to."""
 
     @property
     def mean(self) -> Any:
-        """The free numbers of the start, shape (names,)."""
+        """Free numbers of the start, shape (names,)."""
         plain = {"lam": LAM, "heater_dead_time": self.lags.heater_dead_time}
         return np.array([plain.get(name, 0.0) for name in self.names])
 
     def value(self, name: str, at: float) -> float:
-        """The number where its free number is ``at``; of ``lam``, the product lam dT_0 [K]."""
+        """Value of the number of that name where its free number is ``at``; of ``lam``, the product lam dT_0 [K]."""
         if name in ("lam", "heater_dead_time"):
             return at * self.start.dT_0 if name == "lam" else at
-        start = next(part for part in (Noise(), self.lags, self.start) if name in part._fields)
+        start = next(part for part in (NoiseLevels(), self.lags, self.start) if name in part._fields)
         return float(getattr(start, name) * np.exp(at))
 
     def delays(self, theta: Any) -> Lags:
-        """The lags of free numbers, real or complex, shape (names,)."""
+        """Lags at the free numbers ``theta``, real or complex, shape (names,)."""
         free = dict(zip(self.names, theta, strict=True))
         lag, dead_time, slow = self.lags
         lag, slow = lag * np.exp(free.get("heater_lag", 0.0)), slow * np.exp(free.get("pyrometer_filter", 0.0))
         return Lags(lag, free.get("heater_dead_time", dead_time), slow)
 
     def puller(self, theta: Any) -> Any:
-        """The puller of free numbers, as :meth:`delays`."""
+        """Puller at the free numbers ``theta``, as :meth:`delays`."""
         free = dict(zip(self.names, theta, strict=True))
         factors = {name: np.exp(value) for name, value in free.items() if name in Parameters._fields}
         q = self.start._replace(**{name: getattr(self.start, name) * factor for name, factor in factors.items()})
@@ -179,10 +180,10 @@ class Model(NamedTuple):
         numbers = Parameters(*(number + zero for number in q))
         return derive_puller(numbers, free.get("lam", LAM) + zero, self.meniscus.height, self.meniscus.ring_offset)
 
-    def noises(self, theta: Any) -> Noise:
-        """The noise of free numbers, as :meth:`delays`."""
+    def noises(self, theta: Any) -> NoiseLevels:
+        """Noise at the free numbers ``theta``, as :meth:`delays`."""
         free = dict(zip(self.names, theta, strict=True))
-        return Noise(*(usual * np.exp(free.get(name, 0.0)) for name, usual in Noise()._asdict().items()))
+        return NoiseLevels(*(usual * np.exp(free.get(name, 0.0)) for name, usual in NoiseLevels()._asdict().items()))
 
 
 def predict(log: Log, model: Model, theta: Any) -> Predicted:
@@ -215,7 +216,7 @@ def predict(log: Log, model: Model, theta: Any) -> Predicted:
 
 
 def heating(log: Log, delays: Lags) -> Numbers:
-    """Mean power that heats in the interval before each row [W], shape (rows,)."""
+    """Mean power that reaches the heater's mass in the interval before each row [W], shape (rows,)."""
     late, n, dt = delays.heater_dead_time / log.interval, len(log.Q_H), log.interval
     whole = math.floor(late.real)
     first, second = (log.Q_H[np.clip(np.arange(n) - whole - k, 0, n - 1)] for k in (0, 1))
@@ -230,7 +231,7 @@ def heating(log: Log, delays: Lags) -> Numbers:
     return heats
 
 
-def _sampled(p: Any, noise: Noise, slow: Any, dt: float, meniscus: MeniscusModel) -> tuple[Numbers, Numbers]:
+def _sampled(p: Any, noise: NoiseLevels, slow: Any, dt: float, meniscus: MeniscusModel) -> tuple[Numbers, Numbers]:
     """Transition over dt [s] at the operating point, and the covariance of the disturbances in it (Van Loan 1978)."""
     n, through = len(STATES), p.Q_H_0 - p.G_1a * (p.T_1_0 - p.T_a)
     F, Q = np.zeros((n, n), np.complex128), np.zeros((n, n), np.complex128)
@@ -258,16 +259,16 @@ def _sampled(p: Any, noise: Noise, slow: Any, dt: float, meniscus: MeniscusModel
 
 
 def sensitivities(log: Log, model: Model, theta: Floats) -> tuple[Predicted, Floats, Floats]:
-    """The filter's output at ``theta``, and the derivatives of errors and variances, shape (names, rows, 2)."""
+    """Run the filter at ``theta``, with the derivatives of errors and variances, each of shape (names, rows, 2)."""
     runs = [predict(log, model, theta + 1j * _STEP * unit) for unit in np.eye(len(theta))]
     errors, variances = (np.stack([run[part].imag for run in runs]) / _STEP for part in (0, 1))
     return Predicted(*(np.ascontiguousarray(part.real) for part in runs[0])), errors, variances
 
 
 def smooth(log: Log, model: Model, theta: Floats) -> Floats:
-    """States at each row that the whole log tells, shape (rows, 12); Rauch, Tung and Striebel (1965).
+    """States at each row given the whole log, shape (rows, 12), by the smoother of Rauch, Tung and Striebel (1965).
 
-    The smoother begins anew, as the filter does, at a long gap.
+    It begins anew, as the filter does, at a long gap.
     """
     out = Predicted(*(part.real for part in predict(log, model, theta)))
     slow = np.complex128(model.delays(theta).pyrometer_filter + QUICKEST)

@@ -40,7 +40,7 @@ ROUNDS, EDGE = 30, 0.05
 
 
 class Law(NamedTuple):
-    """A linear law from what a controller has seen and done to its next move."""
+    """Linear law from a controller's past readings and moves to its next move."""
 
     weights: Floats
     """Weights of the readings, then of the drive's last values and means, then a constant."""
@@ -50,8 +50,8 @@ class Law(NamedTuple):
     lowest: float
     highest: float
 
-    def room(self, before: Floats) -> tuple[Floats, Floats]:
-        """The least and largest move from where the drive is."""
+    def move_limits(self, before: Floats) -> tuple[Floats, Floats]:
+        """Least and largest move from where the drive was."""
         return np.maximum(-self.slew, self.lowest - before), np.minimum(self.slew, self.highest - before)
 
     @property
@@ -60,16 +60,19 @@ class Law(NamedTuple):
         return self.weights[-1 - PAST - len(MEANS) : -1]
 
     def run(self, asked: Floats, past: Floats, means: Floats) -> Floats:
-        """Where the drive is after a window; ``asked``: what the readings ask for, shape (windows, rows)."""
+        """Run the law freely over windows; ``asked``: moves that the readings ask for, shape (windows, rows).
+
+        Returns the drive at the end of each window.
+        """
         for each in asked.T:
-            now = past[:, 0] + np.clip(each + np.hstack([past, means]) @ self.own, *self.room(past[:, 0]))
+            now = past[:, 0] + np.clip(each + np.hstack([past, means]) @ self.own, *self.move_limits(past[:, 0]))
             past, means = np.column_stack([now, past[:, :-1]]), self.keep * means + (1.0 - self.keep) * now[:, None]
         last: Floats = past[:, 0]
         return last
 
 
 def measure_excitation(logs: Sequence[Log], start: PullerFile = DEFAULT) -> tuple[float, float]:
-    """How much pull speed and heater move on their own in all logs together, in multiples of what is needed [-].
+    """Sum the moves of pull speed and heater that no reading explains, in multiples of what is needed [-].
 
     The pull speed counts only where the heater does too: a controller with gates and nested limits moves it in ways
     that no linear law explains, up to 25 times what is needed, but not the slow heater.
@@ -103,7 +106,7 @@ def _unexplained(drive: Floats, readings: Floats, log: Log) -> Floats:
     first, last = windows[:, 0], rows[windows[:, -1]]
     asked = seen @ law.weights[: seen.shape[1]] + law.weights[-1]
     free = drive[last] - law.run(asked[windows], own[first, :PAST], own[first, PAST:])
-    single = (moves - np.clip(asked + own @ law.own, *law.room(own[:, 0])))[windows].sum(axis=1)
+    single = (moves - np.clip(asked + own @ law.own, *law.move_limits(own[:, 0])))[windows].sum(axis=1)
     usual = drive[last] - drive[rows[first] - 1]
     *ways, usual = (np.sort(np.abs(each))[: int((1.0 - FEW) * len(each))] for each in (free, single, usual))
     left = max(ways, key=np.linalg.norm)
@@ -118,14 +121,14 @@ def _past(values: Floats, keep: Floats, rows: npt.NDArray[np.int64]) -> Floats:
 
 
 def _fit(X: Floats, moves: Floats, drive: Floats, whole: npt.NDArray[np.bool_], keep: Floats) -> Law:
-    """The law that asks for the moves; a censored regression by successive imputation."""
+    """Fit the law that asks for the moves: a censored regression by successive imputation."""
     sizes, most, ends = np.maximum(X.std(axis=0), 1e-12), np.abs(moves).max(), (drive.min(), drive.max())
     slew = most if np.mean(np.abs(moves) > (1.0 - EDGE) * most) > 0.01 else np.inf
     low, high = (
         end if np.mean(drive == end) > 0.005 else sign * np.inf for end, sign in zip(ends, (-1.0, 1.0), strict=True)
     )
     law = Law(np.zeros(0), keep, float(slew), float(low), float(high))
-    least, largest = law.room(drive[PAST - 1 : -1])
+    least, largest = law.move_limits(drive[PAST - 1 : -1])
     over = (np.abs(largest) > EDGE * most) & (moves >= largest - EDGE * most)
     under = (np.abs(least) > EDGE * most) & (moves <= least + EDGE * most)
     scaled = np.column_stack([X / sizes, np.ones(len(X))])
@@ -148,10 +151,11 @@ CHIPS = 2**BITS - 1
 SEQUENCE = 2.0 * max_len_seq(BITS)[0] - 1.0
 
 
-class Memory(NamedTuple):
-    """What an excited policy remembers."""
+class ExcitationMemory(NamedTuple):
+    """Memory of an excited policy."""
 
     inner: Any
+    """Memory of the policy inside."""
     step: npt.NDArray[np.int64]
     """Number of samples, shape (n,)."""
     added: npt.NDArray[np.float64]
@@ -162,11 +166,11 @@ class Memory(NamedTuple):
 
 @dataclass(frozen=True)
 class Excited:
-    """A policy whose drives also follow a maximal-length binary sequence.
+    """Policy whose drives also follow a maximal-length binary sequence.
 
-    It ends for good where the ring is further than ``limit`` from its reference. The policy does not see the moves that
-    are added, else one that moves from the applied drives would keep them. The drives' limits are those of the
-    environment or plant. Takes "measured" observations, and "history" ones (whose past shows the excitation).
+    The sequence ends for good where the ring is further than ``limit`` from its reference. The policy inside does not
+    see the moves that are added, else one that moves from the applied drives would keep them. The drives' limits are
+    those of the environment or plant. Observations are "measured" or "history" (whose past shows the excitation).
     """
 
     policy: Any
@@ -195,17 +199,17 @@ class Excited:
 
     @property
     def heater_range(self) -> float:
-        """What an action of 1 moves the heater by [W]."""
+        """Change of the heater's power by an action of 1 [W]."""
         return float(getattr(self.policy, "heater_range", HEATER_RANGE))
 
     @property
     def made_for(self) -> Any:
-        """What the policy was made for."""
+        """Environment that the policy was made for, None if it does not say."""
         return getattr(self.policy, "made_for", None)
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[Any, Memory]:
+    ) -> tuple[Any, ExcitationMemory]:
         """Return the action and the next memory; arguments as of :class:`cz_gym.baselines.policy.Policy`."""
         shown = np.array(observation, np.float64)
         seen, single = np.atleast_2d(shown), shown.ndim == 1
@@ -213,7 +217,7 @@ class Excited:
         begins = np.zeros(n, np.bool_) if episode_start is None else np.asarray(episode_start, np.bool_)
         if state is None:
             begins = np.ones(n, np.bool_)
-        last = state or Memory(None, np.zeros(n, np.int64), np.zeros((n, 2)), begins)
+        last = state or ExcitationMemory(None, np.zeros(n, np.int64), np.zeros((n, 2)), begins)
         step, before = np.where(begins, 0, last.step), np.where(begins[:, None], 0.0, last.added)
         error = decode(seen, parameters.v_0, self.heater_range).ring_error
         stopped = (last.stopped & ~begins) | (np.abs(error) > self.limit)
@@ -228,4 +232,4 @@ class Excited:
         out = np.clip(given + drives.asked(wanted, before), -1.0, 1.0)
         added = drives.keep * before + (out - given) * (drives.pull, drives.heater)
         tagged = tag((out[0] if single else out).astype(np.float32), self.made_for)
-        return tagged, Memory(inner, step + 1, added, stopped)
+        return tagged, ExcitationMemory(inner, step + 1, added, stopped)

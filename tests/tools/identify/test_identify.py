@@ -18,7 +18,7 @@ from cz_gym.tools.identify import Excited, identify, read_log, record_log
 from cz_gym.tools.identify.command import main
 from cz_gym.tools.identify.estimate import HEATER, LAGS, PULL, coloured, misfits
 from cz_gym.tools.identify.log import Log, prepare, shift_drives
-from cz_gym.tools.identify.model import LAM, Lags, Model, Noise, heating, predict, sensitivities
+from cz_gym.tools.identify.model import LAM, Lags, Model, NoiseLevels, heating, predict, sensitivities
 from cz_gym.tools.identify.moves import CHIPS, SEQUENCE, measure_excitation
 from cz_gym.tools.registry import make_controller
 from studies.identify import draw, write_logs
@@ -39,7 +39,7 @@ def test_without_noise_the_filter_of_the_true_puller_predicts_every_reading(inte
 
 def test_derivatives_are_those_of_the_filter(logs):
     log = Log(*(each[:400] if isinstance(each, np.ndarray) else each for each in read_log(logs[0])))
-    model = Model((*HEATER, *LAGS, *PULL, *Noise._fields), Parameters(), lags=Lags(2.0, 1.3, 2.0))
+    model = Model((*HEATER, *LAGS, *PULL, *NoiseLevels._fields), Parameters(), lags=Lags(2.0, 1.3, 2.0))
     theta = model.mean + 0.05
     out, *exact = sensitivities(log, model, theta)
     for j, name in enumerate(model.names):

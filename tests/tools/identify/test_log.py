@@ -1,8 +1,5 @@
 """The log reader: other names and units, gaps, repeats, jitter; one line for what is wrong."""
 
-import csv
-from datetime import datetime, timedelta
-
 import numpy as np
 import pandas
 import pytest
@@ -13,30 +10,47 @@ from cz_gym.tools.identify.log import check_puller, column_map, read_log
 from tests.foreign_puller import ForeignPuller, Operator, drive, write_log
 
 
-def read(path):
-    return list(csv.DictReader(path.read_text().splitlines()))
-
-
-def write(path, rows, delimiter=","):
-    lines = [delimiter.join(rows[0]), *(delimiter.join(row.values()) for row in rows)]
-    path.write_text("\n".join(lines) + "\n\n")
+def write(path, rows, separator=","):
+    rows.to_csv(path, sep=separator, index=False)
     return path
 
 
-def test_other_names_units_and_separators_are_the_same_log(logs, tmp_path):
-    start = datetime.fromisoformat("2024-05-01T23:00:00+02:00")
-    rows = [
-        {
-            "when": (start + timedelta(seconds=float(row["time_s"]))).isoformat(),
-            "DIA": f"{0.2 * float(row['ring_radius_mm']):.12g}", "W": f"{1e3 * float(row['heater_power_kW']):.12g}",
-            "SPEED": f"{60.0 * float(row['pull_speed_mm_per_min']):.12g}",
-            "PYRO": f"{float(row['T_1_K']) - 273.15:.12g}", "valid": row["valid"],
-        }
-        for row in read(logs[0])
-    ]  # fmt: skip
+def stamped(rows, form, start="2026-03-01T12:00:00"):
+    times = pandas.Timestamp(start) + pandas.to_timedelta(rows["time_s"].astype(float), unit="s")
+    return rows.assign(time_s=times.dt.strftime(form))
+
+
+def german(rows):
+    return rows.map(lambda text: text.replace(".", ","))
+
+
+def every(name, value):
+    """A change of a column of every row: a value, or a function of the text before."""
+    return lambda rows: rows.assign(**{name: rows[name].map(value) if callable(value) else value})
+
+
+def changed(name, value, at=400):
+    """A change of one row."""
+    return lambda rows: rows.assign(**{name: rows[name].where(rows.index != at, value)})
+
+
+@pytest.fixture(scope="session")
+def rows(logs):
+    """The log with excitation, as text."""
+    return pandas.read_csv(logs[0], dtype=str)
+
+
+def test_other_names_units_and_separators_are_the_same_log(logs, rows, tmp_path):
+    number = rows.astype(float)
+    others = {
+        "DIA": 0.2 * number.ring_radius_mm, "W": 1e3 * number.heater_power_kW, "PYRO": number.T_1_K - 273.15,
+        "SPEED": 60.0 * number.pull_speed_mm_per_min,
+    }  # fmt: skip
+    other = german(pandas.DataFrame({name: value.map("{:.12g}".format) for name, value in others.items()}))
+    other["when"] = stamped(rows, "%Y-%m-%dT%H:%M:%S+02:00").time_s
     (tmp_path / "map.toml").write_text('ring_radius_mm = "DIA:diameter cm"\npull_speed_mm_per_min = "SPEED:mm/h"\n')
     columns = column_map(["time_s=when:iso", "heater_power_kW=W:W", "T_1_K=PYRO:degC"], tmp_path / "map.toml")
-    mine, other = read_log(logs[0]), read_log(write(tmp_path / "other.csv", german(rows), ";"), columns)
+    mine, other = read_log(logs[0]), read_log(write(tmp_path / "other.csv", other, ";"), columns)
     for name in ("time", "ring", "v_p", "Q_H", "T_1"):
         np.testing.assert_allclose(getattr(other, name), getattr(mine, name), rtol=1e-9, err_msg=name)
     assert np.isnan(other.r_ref).all()
@@ -58,13 +72,15 @@ def test_a_parquet_file_is_the_same_log(logs, tmp_path):
         read_log(tmp_path / "log.parquet")
 
 
-def test_gaps_repeats_jitter_and_outliers_are_counted(logs, tmp_path):
-    whole, rows = read_log(logs[0]), read(logs[0])
-    for k, row in enumerate(rows):
-        row["time_s"] = f"{float(row['time_s']) + 0.8 * np.sin(k):.3f}"
-    rows[50]["ring_radius_mm"], rows[60]["valid"], rows[71]["heater_power_kW"] = "150", "0", ""
-    rows[70]["T_1_K"], rows[90]["T_1_K"], rows[80]["time_s"] = "nan", "inf", rows[79]["time_s"]
-    log = read_log(write(tmp_path / "log.csv", rows[:100] + rows[140:]))
+def test_gaps_repeats_jitter_and_outliers_are_counted(logs, rows, tmp_path):
+    whole, rows = read_log(logs[0]), rows.copy()
+    rows["time_s"] = [f"{float(time) + 0.8 * np.sin(k):.3f}" for k, time in enumerate(rows["time_s"])]
+    for row, name, value in (
+        (50, "ring_radius_mm", "150"), (60, "valid", "0"), (71, "heater_power_kW", ""), (70, "T_1_K", "nan"),
+        (90, "T_1_K", "inf"), (80, "time_s", rows.time_s[79]),
+    ):  # fmt: skip
+        rows.loc[row, name] = value
+    log = read_log(write(tmp_path / "log.csv", rows.drop(index=range(100, 140))))
     assert log.interval == pytest.approx(5.0, abs=0.1)
     assert abs(len(log.time) - len(whole.time)) <= 1
     assert log.notes == (
@@ -80,15 +96,6 @@ def test_gaps_repeats_jitter_and_outliers_are_counted(logs, tmp_path):
     assert np.flatnonzero(log.gap).tolist() == [140]
 
 
-def changed(name, value, at=400):
-    return lambda rows: [row | {name: value} if k == at else row for k, row in enumerate(rows)]
-
-
-def every(name, value):
-    """A change of a column of every row: a value, or a function of the text before."""
-    return lambda rows: [row | {name: value(row[name]) if callable(value) else value} for row in rows]
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -100,29 +107,20 @@ def every(name, value):
         (lambda rows: every("time_s", lambda time: time[:-1] + "0")(rows[:390]), "195 rows"),
         (every("time_s", "01.03.2026 12:00:05"), "did you mean time_s=time_s:dmy?"),
         (every("time_s", "12:00:05"), "did you mean time_s=time_s:clock?"),
-        (lambda rows: [row | {" T_1_K": "1800"} for row in rows], "two columns are called 'T_1_K'"),
+        (lambda rows: rows.assign(**{" T_1_K": "1800"}), "two columns are called 'T_1_K'"),
         (lambda rows: rows[:300], "300 rows over 24.9 min are too short a log"),
         (every("T_1_K", "1800"), "T_1_K is constant"),
         (every("valid", "0"), "ring_radius_mm has only 0 good readings in 2161 rows"),
-        (lambda rows: [{k.replace("T_1_K", "T1"): v for k, v in row.items()} for row in rows], "column 'T_1_K'"),
+        (lambda rows: rows.rename(columns={"T_1_K": "T1"}), "column 'T_1_K'"),
         (changed("time_s", "1e9", 2160), "nearly all of it are gaps"),
     ],
 )
-def test_what_is_wrong_is_one_line_with_its_row(change, said, logs, tmp_path):
+def test_what_is_wrong_is_one_line_with_its_row(change, said, rows, tmp_path):
     with pytest.raises(CzError) as error:
-        read_log(write(tmp_path / "bad.csv", change(read(logs[0]))))
+        read_log(write(tmp_path / "bad.csv", change(rows)))
     assert str(error.value).startswith(f"{tmp_path / 'bad.csv'}: ")
     assert said in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def stamped(rows, form, start="2026-03-01T12:00:00"):
-    at = datetime.fromisoformat(start)
-    return [row | {"time_s": (at + timedelta(seconds=float(row["time_s"]))).strftime(form)} for row in rows]
-
-
-def german(rows):
-    return [{name: value.replace(".", ",") for name, value in row.items()} for row in rows]
 
 
 def thousands(rows):
@@ -136,18 +134,16 @@ def inches(rows):
 
 def summer(rows):
     parts = (rows[:1080], "01"), (rows[1080:], "00")
-    return [row for part, hour in parts for row in stamped(part, "%F %T", f"2026-10-25T{hour}:29:57.5")]
+    return pandas.concat([stamped(part, "%F %T", f"2026-10-25T{hour}:29:57.5") for part, hour in parts])
 
 
 def two_columns(rows):
-    return [
-        {"Date": row["time_s"][:10], "Time": row["time_s"][11:]} | {k: v for k, v in row.items() if k != "time_s"}
-        for row in stamped(rows, "%d.%m.%Y %H:%M:%S", "2026-03-01T23:00:00")
-    ]
+    time = stamped(rows, "%d.%m.%Y %H:%M:%S", "2026-03-01T23:00:00").time_s.str
+    return rows.drop(columns="time_s").assign(Date=time[:10], Time=time[11:])
 
 
 def spiked(name, value):
-    return lambda rows: [row if k % 400 != 200 else every(name, value)([row])[0] for k, row in enumerate(rows)]
+    return lambda rows: every(name, value)(rows).where(rows.index % 400 == 200, rows)
 
 
 FORMATS = {
@@ -173,11 +169,11 @@ FORMATS = {
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_every_kind_of_table_is_the_same_log(kind, logs, tmp_path):
+def test_every_kind_of_table_is_the_same_log(kind, logs, rows, tmp_path):
     change, *columns = FORMATS[kind]
     separator = "\t" if "tab" in kind else ";" if "comma" in kind else ","
     mine = read_log(logs[0])
-    other = read_log(write(tmp_path / "log.csv", change(read(logs[0])), separator), column_map(columns))
+    other = read_log(write(tmp_path / "log.csv", change(rows), separator), column_map(columns))
     good = np.isfinite(other.T_1) & (other.unsure == 0.0).all(axis=1)
     spikes = 5 if "row" in kind or "inf" in kind else 0
     assert (good.sum(), len(good)) == (2161 - spikes, 2161)
