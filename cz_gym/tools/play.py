@@ -118,14 +118,8 @@ def _play(arguments: argparse.Namespace) -> None:
 
     fps = max(1, round(arguments.speed / config.control_interval))
     env = CzEnv.from_config(config, "rgb_array", SIZE)
-    play(
-        env,
-        fps=fps,
-        callback=watch,
-        keys_to_action=keys_to_actions(),
-        seed=arguments.seed,
-        noop=np.zeros(2, np.float32),
-    )
+    keys, still = keys_to_actions(), np.zeros(2, np.float32)
+    play(env, fps=fps, callback=watch, keys_to_action=keys, seed=arguments.seed, noop=still)
     if actions:
         print(score(config, arguments.seed, actions, failed))
 
