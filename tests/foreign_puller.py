@@ -6,7 +6,6 @@ meniscus, Heun's moves the states. Numbers are SI inside; readings, setpoints an
 
 import csv
 import math
-from collections import deque
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,12 +18,11 @@ ZONE = {
 }  # fmt: skip
 """A puller of 200 mm crystals [SI]."""
 QUIRKS = {
-    "interval": 2.0, "heater_lag": 0.0, "heater_dead_time": 0.0, "heater_slew": math.inf,
-    "heater_step": 0.0, "pull_slew": math.inf, "pull_window": math.inf, "pyrometer_filter": 0.0,
-    "pyrometer_noise": 0.1, "camera_noise": 0.03, "camera_latency": 0.0, "camera_scale": 1.0, "level_drift": 0.0,
+    "interval": 2.0, "heater_lag": 0.0, "heater_slew": math.inf, "heater_step": 0.0, "pull_slew": math.inf,
+    "pull_window": math.inf, "pyrometer_noise": 0.1, "camera_noise": 0.03,
 }  # fmt: skip
-"""What the machine does: [s], [K], heater in [W] and [W/s], pull in [mm/min] and [mm/min per s], camera in [mm], level
-in [mm/h] of the ring."""
+"""What the machine does: [s], heater in [W] and [W/s], pull in [mm/min] and [mm/min per s], pyrometer in [K], camera in
+[mm]."""
 SLOW = {
     "heater_slew": 1e3 / 60.0, "heater_step": 50.0, "pull_slew": 0.2 / 60.0, "pull_window": 0.3, "camera_noise": 0.05,
 }  # fmt: skip
@@ -52,11 +50,10 @@ class ForeignPuller:
         self.power_0 = through + z.G_1a * (self.T_1_0 - z.T_a)
         self.x = np.array([z.r_0 + 2e-4 * self.random.standard_normal(), self.h_0, self.T_1_0, T_2, melt])
         self.asked = self.power = self.heat = self.power_0
-        self.pull, self.shown, self.time, self.fluctuation = z.v_0, self.T_1_0, 0.0, [0.0, 0.0]
+        self.pull, self.time, self.fluctuation = z.v_0, 0.0, [0.0, 0.0]
         self.parts, self.lost = math.ceil(q.interval), False
-        self.on_the_way = deque([self.power_0] * round(q.heater_dead_time / q.interval * self.parts))
-        self.ring_bias = q.camera_scale * (z.r_0 + self._ring(z.r_0, self.h_0)) - z.r_0
-        self.frames = deque([self._frame()] * (1 + round(q.camera_latency / q.interval)))
+        self.ring_bias = self._ring(z.r_0, self.h_0)
+        self.frame = self._frame()
 
     def _height(self, theta, r):
         m = self.a2 * math.cos(theta) / (4 * r)
@@ -96,9 +93,8 @@ class ForeignPuller:
         ])  # fmt: skip
 
     def _frame(self):
-        q, (r, h) = self.q, self.x[:2]
-        ring = q.camera_scale * (r + self._ring(r, h)) * 1e3 + q.level_drift * self.time / 3600
-        return self.time, ring + q.camera_noise * self.random.standard_normal()
+        r, h = self.x[:2]
+        return self.time, (r + self._ring(r, h)) * 1e3 + self.q.camera_noise * self.random.standard_normal()
 
     def _drives(self, setpoints):
         q, v_0, dt = self.q, self.z.v_0 * 6e4, self.q.interval
@@ -117,13 +113,11 @@ class ForeignPuller:
         """Apply setpoints for one interval; the readings after it, by the names of a plant's tags."""
         self._drives(setpoints)
         q, dt = self.q, self.q.interval / self.parts
-        follow = [1 - math.exp(-dt / tau) if tau else 1.0 for tau in (q.heater_lag, q.pyrometer_filter)]
+        follow = 1 - math.exp(-dt / q.heater_lag) if q.heater_lag else 1.0
         for _ in range(self.parts):
-            self.on_the_way.append(self.power)
-            self.heat += follow[0] * (self.on_the_way.popleft() - self.heat)
+            self.heat += follow * (self.power - self.heat)
             first = self._slopes(self.x)
             self.x = self.x + dt / 2 * (first + self._slopes(self.x + dt * first))
-            self.shown += follow[1] * (self.x[2] - self.shown)
             for i, (tau, sd) in enumerate(MELT):
                 keep = math.exp(-dt / tau)
                 kick = sd * math.sqrt(1 - keep * keep) * self.random.standard_normal()
@@ -133,14 +127,13 @@ class ForeignPuller:
             self.lost = not (abs(r - self.z.r_0) < 8e-3 and 1.2e-3 < h < 1.24 * math.sqrt(self.a2))
             if self.lost:
                 return self.readings()
-        self.frames.append(self._frame())
-        self.frames.popleft()
+        self.frame = self._frame()
         return self.readings()
 
     def readings(self):
         """What a control computer sees."""
-        (at, ring), r_ref = self.frames[0], self.z.r_0 * 1e3
-        T_1 = self.shown + self.q.pyrometer_noise * self.random.standard_normal()
+        (at, ring), r_ref = self.frame, self.z.r_0 * 1e3
+        T_1 = self.x[2] + self.q.pyrometer_noise * self.random.standard_normal()
         seen = dict(zip(COLUMNS, (self.time, ring, self.pull * 6e4, self.power / 1e3, T_1), strict=True))
         for ahead in ("", "_1min", "_5min"):
             seen |= {f"r_ref{ahead}_mm": r_ref, f"T_1_ref{ahead}_K": self.T_1_0}
