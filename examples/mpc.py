@@ -37,7 +37,7 @@ QUIET = {"print_iter": False, "print_header": False, "print_info": False, "error
 
 @dataclass(frozen=True)
 class MPC(LQG):
-    """The predictive controller on the LQG's filter, weights and cost-to-go."""
+    """Predictive controller on the LQG's filter, weights and cost-to-go."""
 
     actuators: Actuators = field(default_factory=Actuators)
     """Limits of the drives."""
@@ -93,7 +93,7 @@ class MPC(LQG):
         return ca.Function("stage", [z, given], [ca.vertcat(after, u), ca.vertcat(u, moves)])
 
     def law(self, estimate: Floats, plan: Floats, previous: Floats) -> Floats:
-        """The best inputs [m/s, W], deviations, shape (n, 2); the LQG's where the prediction is not finite."""
+        """Optimise the inputs [m/s, W], deviations, shape (n, 2); the LQG's where the prediction is not finite."""
         inputs, scale = super().law(estimate, plan, previous), SCALE[PLANT:]
         span = np.array([min(self.v_0, self.actuators.pull_window), self.heater_range]) / scale
         slew = np.array([self.actuators.pull_slew, self.actuators.heater_slew]) * self.control_interval / scale
@@ -132,6 +132,6 @@ def best_corrections(H: Floats, g: Floats, free: Floats, rows: Floats, most: Flo
 
 
 def mpc(config: Config) -> MPC:
-    """The controller for an environment, with the design of ``lqg``."""
+    """Make the controller for an environment, with the design of ``lqg``."""
     scenario = config.sole_scenario
     return MPC(design=BEST_RETURN.design(scenario), actuators=scenario.actuators).for_config(config)

@@ -48,13 +48,13 @@ class Steps(NamedTuple):
     goes_on: Tensor
 
     def sample(self) -> "Steps":
-        """A batch of them."""
+        """Draw a batch of steps."""
         rows = torch.randint(len(self.seen), (BATCH,))
         return Steps(*(each[rows] for each in self))
 
 
 class Actor(nn.Module):
-    """A policy on "history" observations, with the scales of its data."""
+    """Policy on "history" observations, with the scales of its data."""
 
     settings = {"observation": "history", "action": "smooth"}  # noqa: RUF012  # read by rollout
 
@@ -83,7 +83,7 @@ def layers(inputs: int, outputs: int) -> list[nn.Module]:
 
 
 def load(name: str) -> tuple[Any, Steps, Callable[[], Actor]]:
-    """A dataset, its steps, and what makes an actor for them."""
+    """Load a dataset; return it, its steps, and a function that makes an actor for them."""
     dataset = minari.load_dataset(f"cz/randomized/{name}-v0")
     drives, episodes = drives_of("smooth", control_interval=5.0), list(dataset.iterate_episodes())
     smooth = [drives.asked(each.actions, each.observations[:-1, list(DRIVE_CHANNELS)]) for each in episodes]

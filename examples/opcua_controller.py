@@ -28,7 +28,7 @@ from cz_gym.tools.serve.opcua import URI, WRITABLE, certify, password
 
 
 class Controller:
-    """A controller in its shell, which holds bad readings, limits its setpoints and takes over without a jump."""
+    """Controller in its shell, which holds bad readings, limits its setpoints and takes over without a jump."""
 
     def __init__(self, name: str, config: Config, compiled: bool = False) -> None:
         block = make_block(name, config)
@@ -36,7 +36,7 @@ class Controller:
         self._memory = self._runner.start(1)
 
     def setpoints(self, tags: dict[str, Any]) -> list[float]:
-        """The setpoints for the tags of a step, whose names are those of the block's inputs and settings."""
+        """Compute the setpoints for the tags of a step, whose names are those of the block's inputs and settings."""
         given = tags | {"ring_time_s": tags["time_s"], "automatic": True}
         outputs, self._memory = self._runner.run(given, self._memory)
         return [float(outputs[name][0]) for name in SETPOINT_NAMES]

@@ -46,7 +46,7 @@ MELT_SD = 0.1
 """Standard deviation of the logarithm of the melt's numbers in handbooks [-]."""
 ONE = Pullers(RANDOMIZED.pullers.mix, start_radius_sd=0.2 * MM)
 SCENARIO = replace(RANDOMIZED, name="randomized, one puller", pullers=ONE)
-"""The scenario ``randomized`` without its spread of pullers."""
+"""Scenario ``randomized`` without its spread of pullers."""
 
 
 class Row(NamedTuple):

@@ -36,7 +36,7 @@ class Row(NamedTuple):
 
 
 def rows() -> list[Row]:
-    """The whole comparison, in the paper's order."""
+    """Compare every number, in the paper's order."""
     return [*_linear_rows("I"), *_linear_rows("II"), *_compensator_rows(), *_margin_rows(), *_response_rows()]
 
 
@@ -129,7 +129,7 @@ def _response_rows() -> list[Row]:
 
 
 def comparison(rows: list[Row]) -> str:
-    """The comparison as a Markdown table, numbers with five significant digits."""
+    """Write the comparison as a Markdown table, numbers with five significant digits."""
     lines = []
     for row in rows:
         published, difference = "-", "-"
@@ -141,12 +141,12 @@ def comparison(rows: list[Row]) -> str:
 
 
 def numbers() -> dict[str, Any]:
-    """The content of numbers.json: the comparison's values by quantity, a published one null where there is none."""
+    """Content of numbers.json: the comparison's values by quantity, a published one null where there is none."""
     return {row.quantity: {"unit": row.unit, "published": row.published, "ours": row.ours} for row in rows()}
 
 
 def report(captions: Mapping[str, str]) -> str:
-    """The whole report: template.md, filled in, with figures of these captions."""
+    """Fill in template.md, with figures of these captions."""
 
     def figures(*marks: str) -> str:
         shown = {name: caption for name, caption in captions.items() if name.startswith(marks)}
@@ -161,7 +161,7 @@ def report(captions: Mapping[str, str]) -> str:
 
 
 def _table(head: str, lines: Iterable[Iterable[str]]) -> str:
-    """A table; the names of its columns are separated by |."""
+    """Write a table; the names of its columns are separated by |."""
     return table(head.split(" | "), lines, "---")
 
 
@@ -178,7 +178,7 @@ def _margins() -> str:
 
 
 def _without() -> str:
-    """The ramp without the compensator, beside the ramp with it."""
+    """Compare the ramp without the compensator with the ramp with it."""
     lines = []
     for (label, policy), model in product((("with", ex.PRINTED), ("without", ex.BARE)), ex.MODELS):
         run = ex.ramp(model, policy)

@@ -29,7 +29,7 @@ ZERO = 0.021
 COMPENSATOR = Compensator()
 """The paper's compensator, G_pc,real."""
 ODE = (1.884e-3, 3.368e-7)
-"""The compensator as a differential equation in time: coefficients of y_pc' [rad/s] and y_pc [(rad/s)^2]."""
+"""Compensator as a differential equation in time: coefficients of y_pc' [rad/s] and y_pc [(rad/s)^2]."""
 PID = SeriesPID()
 """The paper's PID, Table 1."""
 CROSSOVER = 0.03275
@@ -42,7 +42,7 @@ MODELS = {"I": 1.0, "II": 0.0}
 SOURCES = ("published", "own")
 """Sources of linear models: the paper's functions, our plant."""
 PRINTED, BARE = CompensatedPID(pid=PID), CompensatedPID(pid=PID, compensator=None)
-"""The printed controller, and its PID alone."""
+"""Printed controller, and its PID alone."""
 INTERVAL = 5.0
 """Time between actions in closed loop [s]."""
 FINE = 1.0
@@ -61,7 +61,7 @@ def linear_model(source: str, model: str) -> RadiusModel:
 
 @cache
 def compensator(source: str) -> Compensator:
-    """The design procedure applied to Model I of one of SOURCES."""
+    """Apply the design procedure to Model I of one of SOURCES."""
     return design_compensator(linear_model(source, "I"))
 
 
@@ -81,7 +81,7 @@ class Trace(NamedTuple):
     r_tilde: Floats
     """Ring minus bias plus compensator [m]; without a compensator, ring minus bias."""
     failed: bool
-    """Whether the episode ended in a failure."""
+    """True if the episode ended in a failure."""
 
     @property
     def minutes(self) -> Floats:
@@ -124,7 +124,7 @@ def pull_change(
 
 
 def inverse_response(run: Trace, change: float = -0.1) -> tuple[float, float]:
-    """The ring's largest excursion in the wrong direction after a pull change [m], and the time until it is back [s].
+    """Measure the ring's largest move the wrong way after a pull change [m], and the time until it is back [s].
 
     ArithmeticError if it never comes back.
     """
@@ -150,12 +150,12 @@ def case_difference(model: str) -> dict[str, float]:
 
 
 def cases(model: str) -> tuple[Trace, Trace]:
-    """Cases A and B."""
+    """Run the paper's cases A and B."""
     return trace(PRINTED, model, "reference-a"), trace(PRINTED, model, "reference-b")
 
 
 def ramp(model: str, policy: Any = PRINTED, meniscus: MeniscusModel = HURLE) -> Trace:
-    """The paper's temperature ramp."""
+    """Run the paper's temperature ramp."""
     return trace(policy, model, "paper-ramp", meniscus=meniscus)
 
 

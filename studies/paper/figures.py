@@ -1,4 +1,4 @@
-"""The paper's figures of data, drawn from our runs in the paper's layout."""
+"""Figures of the paper that show data, drawn from our runs in the paper's layout."""
 
 from collections.abc import Callable
 from functools import partial
@@ -35,14 +35,14 @@ SHOWN = {
 
 
 def values(run: Trace, name: str) -> Floats:
-    """A signal in the unit people read; "ring" is the bright ring less the operator's bias."""
+    """Return a signal in the unit that people read; "ring" is the bright ring less the operator's bias."""
     own = {"r_tilde": run.r_tilde, "ring": run.signals.r_br - make_puller().ring_bias}
     signal: Floats = own[name] if name in own else getattr(run.signals, name)
     return signal / SHOWN[name][0]
 
 
 def draw(axis: Any, run: Trace, *names: str, legend: bool = False, **line: Any) -> None:
-    """Signals against time, and the axis of the first named; ``line`` takes precedence over SHOWN."""
+    """Draw signals against time, and the axis of the first named; ``line`` takes precedence over SHOWN."""
     for name in names:
         _, _, style, colour, label = SHOWN[name]
         axis.plot(run.minutes, values(run, name), **({"ls": style, "color": colour, "label": label} | line))

@@ -41,9 +41,9 @@ WIDER = 1.3
 """Factor on the standard deviations of the curvature, which is steeper at the maximum than around it; ``python -m
 studies.identify`` counts the intervals that hold the truth."""
 INFORMED = 0.5
-"""An informed parameter keeps less than this share of the prior's standard deviation [-]."""
+"""Share of the prior's standard deviation that is left of an informed parameter's, at most [-]."""
 AT_REST = 8, 0.02
-"""The search ends where as many steps have gained less: a dead time of whole rows is a kink, where it cannot go on."""
+"""Number of steps and the gain in them below which the search ends: a dead time of whole rows is a kink."""
 CAUTIOUS = {"pyrometer_sd": 20.0, "camera_sd": 4.0}
 """Factors on the noise where the search begins, so that the filter of a wrong puller can follow the log."""
 
@@ -85,7 +85,7 @@ class Identified:
     """Prediction errors of pyrometer and ring in their standard deviations, shape (rows, 2); NaN without a reading."""
     predicted: Predicted
     logs: tuple[Log, ...]
-    """The logs in the rows that were estimated from."""
+    """Logs in the rows that were estimated from."""
     settled: bool
     """True if the search has ended at a maximum."""
     misfits: tuple[str, ...] = ()
@@ -93,7 +93,7 @@ class Identified:
 
     @property
     def log(self) -> Log:
-        """The logs one after the other."""
+        """Logs one after the other."""
         return join_logs(self.logs)
 
     def series(self, meniscus: MeniscusModel = HURLE) -> list[tuple[Floats, Floats, Floats]]:
@@ -207,7 +207,7 @@ class Maximum(NamedTuple):
     covariance: Floats
     """Covariance of the free numbers."""
     out: Predicted
-    """The filter's output there."""
+    """Output of the filter at the maximum."""
     settled: bool
 
     @property

@@ -1,7 +1,8 @@
 """Log of a puller: read from CSV or Parquet with any names and units, put on a regular grid, written.
 
 Fields are read as text, because a line about a wrong one names its row and column as the file has them; pandas' own
-conversion of a column would tell neither. The grid follows the times of the rows slowly, as a clock drifts.
+conversion of a column would tell neither. The grid follows the times of the rows slowly, as a clock drifts: pandas'
+``merge_asof`` on equal times would lose one reading in twelve of a log whose clock drifts by 0.1 %.
 """
 
 import csv
@@ -46,9 +47,9 @@ COLUMNS: dict[str, Units] = {
     "r_ref_mm": RADIUS,
     "T_1_ref_K": TEMPERATURE,
 }
-"""A log's columns, with the units that each may have; the first is its own."""
+"""Columns of a log, with the units that each may have; the first is its own."""
 REQUIRED = tuple(COLUMNS)[:5]
-"""The columns that a log must have."""
+"""Columns that a log must have."""
 DRIVES = "pull_speed_mm_per_min", "heater_power_kW"
 ABSENT = ("", "nan", "null", "none", "na", "n/a", "#n/a", "-", "--", "---", "<na>", "nat")
 """Fields that hold no number."""
@@ -190,7 +191,7 @@ ABSURD = 2.0
 
 
 class Log(NamedTuple):
-    """A log on a regular grid, SI units; each of shape (rows,). Readings that are missing are NaN."""
+    """Log on a regular grid, SI units; arrays of shape (rows,). Readings that are missing are NaN."""
 
     time: Floats
     """Times of the rows [s]."""
@@ -207,13 +208,13 @@ class Log(NamedTuple):
     T_1_ref: Floats
     """Recipe of the pyrometer's temperature [K]; NaN if the log has none."""
     gap: npt.NDArray[np.bool_]
-    """Whether the row is the first after a long gap."""
+    """True in the first row after a long gap."""
     unsure: Floats
     """Standard deviations of pull speed [m/s] and power [W] in rows that do not have them, shape (rows, 2); else 0."""
     interval: float
     """Time between rows [s]."""
     notes: tuple[str, ...] = ()
-    """What was left out or filled, in words."""
+    """Notes of what was left out or filled, in words."""
     mean_of: int = 1
     """Number of the sensors' readings that a row's are the means of."""
 

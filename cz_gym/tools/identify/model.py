@@ -1,4 +1,4 @@
-"""The filter whose prediction errors are made small: an extended Kalman filter on the plant, and its derivatives.
+"""Filter whose prediction errors are made small: an extended Kalman filter on the plant, and its derivatives.
 
 Twelve states: the plant's five, a fast and a slow fluctuation of the interface temperature [K], a heat load on the melt
 [W] with its rate [W/s], the constant offsets of pyrometer [K] and ring [m], and T_1 behind the pyrometer's filter [K].
@@ -85,7 +85,7 @@ class Predicted(NamedTuple):
     state: Any
     """Estimated states after each row, shape (rows, 12)."""
     before: Any
-    """The states that were expected before each row."""
+    """States that were expected before each row."""
     covariance: Any
     """Covariance of the estimates, shape (rows, 12, 12)."""
 

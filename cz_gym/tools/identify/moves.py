@@ -45,7 +45,7 @@ class Law(NamedTuple):
     weights: Floats
     """Weights of the readings, then of the drive's last values and means, then a constant."""
     keep: Floats
-    """How much of the drive's means is left after a row [-]."""
+    """Shares of the drive's means that are left after a row [-]."""
     slew: float
     lowest: float
     highest: float
@@ -161,7 +161,7 @@ class ExcitationMemory(NamedTuple):
     added: npt.NDArray[np.float64]
     """Deviation of the drives by the excitation, in shares of their ranges, shape (n, 2)."""
     stopped: npt.NDArray[np.bool_]
-    """Whether the radius error has ended the excitation, shape (n,)."""
+    """True where the radius error has ended the excitation, shape (n,)."""
 
 
 @dataclass(frozen=True)
