@@ -143,7 +143,7 @@ def two_columns(rows):
 
 
 def spiked(name, value):
-    return lambda rows: every(name, value)(rows).where(rows.index % 400 == 200, rows)
+    return lambda rows: pandas.concat([rows[rows.index % 400 != 200], every(name, value)(rows[200::400])]).sort_index()
 
 
 FORMATS = {
