@@ -3,14 +3,27 @@
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cz_gym import CzVectorEnv, agents
+from cz_gym.config import make_config
+from cz_gym.episodes.scenario import Actuators
+from cz_gym.episodes.scenarios import RANDOMIZED
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.evaluation.user_code import controller
 from cz_gym.sb3 import CzVecEnv
+from cz_gym.support.units import KILO, MINUTE, MM_PER_MIN
+from cz_gym.tools.registry import make_controller
 from examples import gradient, ppo_lagrangian, sb3_ppo
+from tests.observed import PLAIN
+
+SEEDS = range(1_000_000, 1_000_002)
+MPC = "examples/mpc.py:mpc"
 
 
 @pytest.mark.usefixtures("few_crystals")
@@ -50,3 +63,24 @@ def test_an_example_without_its_packages_says_in_one_line_what_to_install():
     done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
     assert done.returncode == 1
     assert re.fullmatch(r"\w+ is missing: .*pip install .*\n", done.stderr)
+
+
+def test_the_predictive_controller_holds_a_crystal_as_lqg_does():
+    config = make_config(horizon=600.0, **PLAIN)
+    own, lqg = (
+        rollout(policy, config, SEEDS) for policy in (controller(MPC).make(config), make_controller("lqg", config))
+    )
+    assert not own.failed.any()
+    np.testing.assert_allclose(metrics(own).rmse_mm, metrics(lqg).rmse_mm, rtol=0.05)
+
+
+def test_the_predictive_controller_asks_for_nothing_beyond_the_limits_of_the_drives():
+    actuators = Actuators(
+        pull_window=0.02 * MM_PER_MIN, pull_slew=0.05 * MM_PER_MIN / MINUTE, heater_slew=0.5 * KILO / MINUTE
+    )
+    config = make_config(replace(RANDOMIZED, name="narrow", actuators=actuators), horizon=300.0, **PLAIN)
+    with pytest.warns(UserWarning, match=r"lqg was not tuned for actuators\.pull_window"):
+        run = rollout(controller(MPC).make(config), config, SEEDS)
+    pull = run.signals.v_p - config.parameters.v_0
+    assert not run.failed.any()
+    assert np.abs(pull).max() == pytest.approx(actuators.pull_window, rel=1e-3)
