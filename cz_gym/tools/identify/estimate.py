@@ -308,10 +308,7 @@ def misfits(identified: Identified, puller: Any, away: Mapping[str, float]) -> t
     if not heater and identified.excitation[0] < 1.0:
         return ()
     reasons = [] if identified.settled else ["the search has not settled"]
-    for sensor, name in enumerate(SENSORS):
-        large = np.nanstd(identified.predicted.error[:, sensor]) > LEAST_ERROR[sensor]
-        if (heater or name == "ring") and large and (size := coloured(identified.errors[:, sensor])) > COLOURED:
-            reasons.append(f"prediction errors of the {name} are coloured (correlation {size:.2f})")
+    reasons += _coloured_errors(identified, SENSORS if heater else SENSORS[1:])
     if heater:
         reasons += _off_the_operating_point(identified.log, puller)
     parameters = {e.name for e in identified.estimates} - set(LAGS)
@@ -324,6 +321,16 @@ def misfits(identified: Identified, puller: Any, away: Mapping[str, float]) -> t
     except CzError as error:
         reasons.append(f"its numbers are not plausible: {error}")
     return tuple(reasons)
+
+
+def _coloured_errors(identified: Identified, judged: Sequence[str]) -> list[str]:
+    """Find sensors whose prediction errors are correlated and larger than a sensor shows."""
+    reasons = []
+    for sensor, name in enumerate(SENSORS):
+        large = name in judged and np.nanstd(identified.predicted.error[:, sensor]) > LEAST_ERROR[sensor]
+        if large and (size := coloured(identified.errors[:, sensor])) > COLOURED:
+            reasons.append(f"prediction errors of the {name} are coloured (correlation {size:.2f})")
+    return reasons
 
 
 def _off_the_operating_point(log: Log, puller: Any) -> list[str]:
