@@ -40,7 +40,7 @@ from cz_gym.support.units import HOUR, KILO, MM_PER_MIN
 from .jit import jittable, static
 
 GROWS, LOST, DONE = 0, 1, 2
-"""What ``accept`` says of a substep: it goes on, it ends in failure, it ends with success."""
+"""Outcomes of a substep by ``accept``: the crystal grows on, is lost, is done with success."""
 PULL_SCALE, HEATER_SCALE = 1.2 * MM_PER_MIN, 10.0 * KILO
 """Ranges of the default puller's drives [m/s, W], in which channels of these units are scaled."""
 NO_OPERATING_POINT = "these parameters have no finite operating point; check temperatures and conductances"
@@ -227,7 +227,7 @@ class Process(NamedTuple):
     """``draw_sensor_noise(slot)``: writes a sample of sensors of its own into ``StepMemory``, with random numbers from
     ``slot.streams``."""
     nominal_moves: bool = False
-    """Whether ``nominal`` depends on the state."""
+    """True where ``nominal`` depends on the state."""
     name: str = ""
     """Name of its environment in ``gym.make``."""
     table: tuple[int, int] = (0, 0)

@@ -1,4 +1,4 @@
-"""The process of ``Cz-v0``: plant, signals, task and cost of a crystal's body as one value for the engine."""
+"""The process of ``Cz-v0``: plant, signals, task and cost of a crystal's body as one value, and its linear model."""
 
 from typing import Any, NamedTuple
 
@@ -12,7 +12,6 @@ from cz_gym.physics.numerics import StateSpace
 from cz_gym.physics.numerics import linearise as linearise_process
 from cz_gym.physics.parameters import Parameters, check_parameters
 from cz_gym.physics.plant import (
-    HEIGHT_MAX_IN_A,
     HEIGHT_MIN,
     NO_DISTURBANCE,
     RADIUS_LIMIT,
@@ -28,7 +27,6 @@ from cz_gym.process import GROWS, LOST, Inputs, PerfectReadings, Process
 from cz_gym.support.units import MM
 
 from . import signals
-from . import signals as cost
 
 _LOW = 5.0 * MM
 """Above this height no melt can freeze the meniscus within half a substep [m]."""
@@ -82,15 +80,6 @@ def rates(x: Any, u: Any, d: Any, p: Any, m: Any) -> Any:
 
 
 @jittable
-def height_inside(h_c: Any, p: Any) -> Any:
-    """The meniscus height limited to its range, so that a failed state can still be measured."""
-    top = HEIGHT_MAX_IN_A * p.a
-    if h_c.real < HEIGHT_MIN:
-        return HEIGHT_MIN
-    return top if h_c.real > top else h_c
-
-
-@jittable
 def accept(slot: Any, x: Any, new: Any, u: Any, d: Any, t: Any, dt: Any, limit: Any, m: Any) -> Any:
     """The state after a substep and whether the crystal still grows, at this moment's reference."""
     p = slot.puller
@@ -119,30 +108,15 @@ def accept_substep(
 @jittable
 def perfect_readings(x: Any, p: Any, m: Any) -> Any:
     """The bright ring around the crystal, with and without the operator's bias, and the heater."""
-    h_c = height_inside(x.h_c, p)
+    h_c = signals.height_inside(x.h_c, p)
     ring = x.r_c + m.ring_offset(x.r_c, h_c, p)
     return PerfectReadings(ring, ring - p.ring_bias, h_c, x.T_1)
 
 
 @jittable
-def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, m: Any) -> Any:
-    """The rows of ``info``, growth taken at a height within the limits."""
-    p, x = slot.puller, slot.x
-    at = State(x.r_c, height_inside(x.h_c, p), x.T_1, x.T_2, x.T_b)
-    at_interface = growth(at, Disturbance(slot.Q_d, slot.dT_i, 1.0), p, m.slope)
-    return signals.logged(slot, measured, cost, t, ring, at_interface)
-
-
-@jittable
-def brief_info(slot: Any, measured: Any) -> Any:
-    """True radius, its reference, and whether the crystal is out of tolerance."""
-    return signals.BriefInfo(slot.x.r_c, slot.puller.r_0 + measured.r_ref, signals.out_of_tolerance(slot, measured))
-
-
-@jittable
 def update_memory(memory: Any, u: Any, nominal: Any, interval: Any) -> Any:
     """The mean pull speed after an interval."""
-    return StepMemory(cost.moved_mean(memory.v_p_mean, u.v_p, interval))
+    return StepMemory(signals.moved_mean(memory.v_p_mean, u.v_p, interval))
 
 
 @jittable
@@ -150,7 +124,7 @@ def cost_inputs(x: Any, u: Any, before: Any, memory: Any, slot: Any, t: Any) -> 
     """True radius error less what no sensor shows [m], mean pull speed above nominal [-], steps of both drives."""
     p, e = slot.puller, slot.episode
     error = x.r_c - p.r_0 - reference(t, e) + bias_offset(t, e)
-    return cost.Cost(error, memory.v_p_mean / p.v_0 - 1.0, u.v_p - before.v_p, u.Q_H - before.Q_H)
+    return signals.Cost(error, memory.v_p_mean / p.v_0 - 1.0, u.v_p - before.v_p, u.Q_H - before.Q_H)
 
 
 def points(p: Puller) -> list[tuple[State, Inputs, Disturbance]]:
@@ -174,7 +148,7 @@ BODY = Process(
     TrueState=signals.TrueState,
     Logged=signals.Logged,
     BriefInfo=signals.BriefInfo,
-    Cost=cost.Cost,
+    Cost=signals.Cost,
     past=signals.PAST,
     relative=signals.RELATIVE,
     check=check,
@@ -188,14 +162,14 @@ BODY = Process(
     perfect_readings=perfect_readings,
     measure=signals.measure,
     true_state=signals.true_state,
-    logged=logged,
-    brief_info=brief_info,
+    logged=signals.logged,
+    brief_info=signals.brief_info,
     cost_inputs=cost_inputs,
-    cost_terms=cost.cost_terms,
-    cost_slopes=cost.cost_slopes,
-    reward=cost.reward,
+    cost_terms=signals.cost_terms,
+    cost_slopes=signals.cost_slopes,
+    reward=signals.reward,
     points=points,
-    weights=cost.WEIGHTS,
+    weights=signals.WEIGHTS,
     StepMemory=StepMemory,
     update_memory=update_memory,
     name="Cz-v0",

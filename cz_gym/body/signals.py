@@ -1,7 +1,12 @@
-"""The cost of a step: its four terms, their scales and weights, the reward that follows from it, and derivatives.
+"""Cost and signals of a crystal's body.
 
-Reward, gradients, regulators, bounds and reports all read this module. The weights are chosen so that most of a good
-controller's cost is its radius error; ``python -m studies.frontier`` shows how well the return ranks controllers.
+The cost of a step has four terms, each with a scale and a weight; the reward follows from them. Reward, gradients,
+regulators, bounds and reports all read this module. The weights are chosen so that most of a good controller's cost is
+its radius error; ``python -m studies.frontier`` shows how well the return ranks controllers.
+
+The table of signals holds every number of an observation or of ``info``, and the function that computes it. A signal
+is a field of :class:`Measured` (readings and recipe), :class:`TrueState` (the plant) or :class:`Logged` (``info``); its
+annotation gives unit, scale and meaning. Channels, decoding, ``info`` and the pages' tables all follow from here.
 """
 
 from typing import Annotated, Any, NamedTuple
@@ -9,6 +14,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from cz_gym.jit import jittable
+from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, Disturbance, State, growth
 from cz_gym.physics.schedule import bias_offset, recipe, reference
 from cz_gym.process import HEATER_SCALE, PULL_SCALE, Past, Relative, read_drives, signals
 from cz_gym.process import Channel as Channel
@@ -127,11 +133,7 @@ def reward(cost: Any, grows: Any) -> Any:
     return earned if grows else earned - FAILURE_COST
 
 
-# The table of signals: every number that an observation or ``info`` holds, and the function that computes it.
-#
-# A signal is a field of :class:`Measured` (readings and recipe), :class:`TrueState` (the plant) or :class:`Logged`
-# (``info``); its annotation gives unit, scale and meaning. The function below each class computes its fields by name,
-# in SI units. Channels, decoding, ``info`` and the pages' tables all follow from here.
+# The table of signals; the function below each class computes its fields by name, in SI units.
 
 PREVIEWS = (0.0, 1.0 * MINUTE, 5.0 * MINUTE)
 """Times ahead for which reference and recipe are observed [s]."""
@@ -141,7 +143,7 @@ TEMPERATURE_SCALE = 5.0
 
 
 class Measured(NamedTuple):
-    """What a puller's control computer knows, in SI units; arrays of the batch's shape where decoded.
+    """Readings and recipe in a puller's control computer, in SI units; arrays of the batch's shape where decoded.
 
     Temperatures, power and pull speed are deviations from the puller's own nominal; radii from r_0.
     """
@@ -270,9 +272,21 @@ def out_of_tolerance(slot: Any, measured: Any) -> Any:
 
 
 @jittable
-def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, at_interface: Any) -> Any:
-    """:class:`Logged` of a slot at its sample's time t [s]; ``ring`` [m] is the true bright ring."""
+def height_inside(h_c: Any, p: Any) -> Any:
+    """The meniscus height limited to its range, so that a failed state can still be measured."""
+    top = HEIGHT_MAX_IN_A * p.a
+    if h_c.real < HEIGHT_MIN:
+        return HEIGHT_MIN
+    return top if h_c.real > top else h_c
+
+
+@jittable
+def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, m: Any) -> Any:
+    """:class:`Logged` of a slot at its sample's time t [s], growth taken at a height within the limits; ``ring`` [m] is
+    the true bright ring."""
     p, x = slot.puller, slot.x
+    inside = State(x.r_c, height_inside(x.h_c, p), x.T_1, x.T_2, x.T_b)
+    at_interface = growth(inside, Disturbance(slot.Q_d, slot.dT_i, 1.0), p, m.slope)
     return Logged(
         r_c=x.r_c,
         r_br=ring,
@@ -305,6 +319,12 @@ class BriefInfo(NamedTuple):
     cost: Any
 
 
+@jittable
+def brief_info(slot: Any, measured: Any) -> Any:
+    """True radius, its reference, and whether the crystal is out of tolerance."""
+    return BriefInfo(slot.x.r_c, slot.puller.r_0 + measured.r_ref, out_of_tolerance(slot, measured))
+
+
 PAST = (
     Past("ring_error", 0.2 * MM),
     Past("v_p", 0.2 * PULL_SCALE),
@@ -320,9 +340,5 @@ RELATIVE = (
     Relative("T_1", "T_1_ref", 2.0, "pyrometer reading minus recipe"),
 )
 """The signals that "history" shows relative to another one."""
-MEASURED = tuple(signals(Measured).values())
-"""Channels of ``observation="measured"``."""
-STATE = tuple(signals(TrueState).values())
-"""Channels of ``observation="state"``."""
 INFO_ROWS = tuple(signals(Logged).values())
 """Channels of ``info``."""

@@ -1,4 +1,4 @@
-"""The parameters of a whole crystal: a puller's, its recipe's, and the part of the crystal that is grown."""
+"""The parameters of a whole crystal, its stages, and its plant."""
 
 import math
 from collections.abc import Mapping
@@ -223,7 +223,7 @@ def wall(deep: Any, p: Any) -> Any:
 
 
 class Interface(NamedTuple):
-    """What follows from the state at the interface."""
+    """Growth, heat fluxes and meniscus at the interface, which follow from the state."""
 
     v_g: Any
     """Growth rate [m/s]."""

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.body import signals as cost
 from cz_gym.body.process import BODY
-from cz_gym.episodes.draw import Episode, Factors, Stream
+from cz_gym.body.signals import Cost, moved_mean
+from cz_gym.episodes.draw import Episode, Factors
 from cz_gym.episodes.rng import normal
 from cz_gym.jit import jittable
 from cz_gym.physics.meniscus import MeniscusModel
@@ -17,19 +17,17 @@ from cz_gym.physics.numerics import linearise
 from cz_gym.physics.parameters import check_parameters
 from cz_gym.physics.plant import HEIGHT_MAX_IN_A, hidden_load
 from cz_gym.physics.schedule import DRAW_SPAN, bias_offset
-from cz_gym.process import NO_OPERATING_POINT, Inputs, PerfectReadings, Process
+from cz_gym.process import NO_OPERATING_POINT, Inputs, PerfectReadings
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import KILO, MM
 
 from . import plant, recipe, signals
-from . import recipe as task
 from .plant import (
     APART,
     NO_DISTURBANCE,
     STAGES,
     CrystalState,
     Disturbance,
-    at_interface,
     check_shape,
     complete,
     parts,
@@ -40,7 +38,6 @@ from .signals import weight
 
 SLACK = 1.3
 """Time that an episode may last, in multiples of the recipe's [-]."""
-_START = int(Stream.START)
 Floats = npt.NDArray[np.float64]
 
 
@@ -83,7 +80,7 @@ def check(parameters: Any, meniscus: MeniscusModel) -> Any:
     left = growth.M_0 - at.M_s - at.M_men
     for fails, what in (
         (left <= 0.0, f"the charge of {growth.M_0:g} kg is used up: the crystal weighs {at.M_s[-1]:.3g} kg"),
-        (~((at.h_c >= task.HEIGHT_MIN) & (at.h_c <= HEIGHT_MAX_IN_A * p.a)), "the meniscus is out of its range"),
+        (~((at.h_c >= recipe.HEIGHT_MIN) & (at.h_c <= HEIGHT_MAX_IN_A * p.a)), "the meniscus is out of its range"),
         (np.isnan(at.ring), f"the meniscus {meniscus.name!r} does not hold ({meniscus.covers})"),
         (~(at.T_b > p.T_m), "the melt would have to be colder than its melting point: less growth rate there"),
         (~(at.v_p > 0.0), "the pull speed is not positive"),
@@ -103,8 +100,8 @@ def duration(parameters: Any, meniscus: MeniscusModel, interval: float) -> float
     longest = 0.0
     for stage, name in enumerate(STAGES):
         if getattr(parameters, name) > 0.0:
-            start, stop = task.span(stage, 0.0, table, p)
-            longest = max(longest, float(task.time_at(stop, table, p) - task.time_at(start, table, p)))
+            start, stop = recipe.span(stage, 0.0, table, p)
+            longest = max(longest, float(recipe.time_at(stop, table, p) - recipe.time_at(start, table, p)))
     return interval * math.ceil(SLACK * longest / interval)
 
 
@@ -113,12 +110,12 @@ def begin(slot: Any, m: Any) -> Any:
     """The recipe of the drawn puller, and the state on it where the drawn stage begins, the radius off by what was
     drawn."""
     p, table = slot.puller, slot.table
-    task.reference_along(slot)
+    recipe.reference_along(slot)
     recipe.fill(table, p, slot.episode, m)
-    stage, u = task.draw_stage(slot)
-    start, stop = task.span(stage, u, table, p)
+    stage, u = recipe.draw_stage(slot)
+    start, stop = recipe.span(stage, u, table, p)
     slot.stop, slot.v_p_mean = stop, 0.0
-    task.stretch(slot, (task.time_at(stop, table, p) - task.time_at(start, table, p)) / DRAW_SPAN)
+    recipe.stretch(slot, (recipe.time_at(stop, table, p) - recipe.time_at(start, table, p)) / DRAW_SPAN)
     x = recipe.state_at(start, table, p, slot.episode)
     return CrystalState(x.r_c + slot.episode.r_c_start, x.h_c, x.T_1, x.T_2, x.T_b, x.L, x.A_s, x.M_s, x.N)
 
@@ -142,41 +139,22 @@ def disturb(Q_d: Any, dT_i: Any, t: Any, e: Any) -> Any:
 @jittable
 def perfect_readings(x: Any, p: Any, m: Any) -> Any:
     """The bright ring around the crystal and the heater; the recipe's ring is subtracted later, at the length grown."""
-    h_c = task.height_inside(x.h_c, p)
+    h_c = recipe.height_inside(x.h_c, p)
     ring = x.r_c + m.ring_offset(x.r_c, h_c, p)
     return PerfectReadings(ring, ring, h_c, x.T_1)
 
 
 @jittable
-def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, m: Any) -> Any:
-    """The rows of ``info``, growth taken at a height within the limits."""
-    p, x = slot.puller, slot.x
-    at = CrystalState(x.r_c, task.height_inside(x.h_c, p), x.T_1, x.T_2, x.T_b, x.L, x.A_s, x.M_s, x.N)
-    return signals.logged(slot, measured, cost, t, ring, at_interface(at, Disturbance(slot.Q_d, slot.dT_i), p, m.slope))
-
-
-@jittable
-def brief_info(slot: Any, measured: Any) -> Any:
-    """True radius, its reference, whether the crystal is out of tolerance, and whether it is long enough."""
-    return signals.BriefInfo(
-        slot.x.r_c,
-        slot.puller.r_0 + measured.r_ref,
-        signals.out_of_tolerance(slot, measured),
-        signals.succeeded(slot),
-    )
-
-
-@jittable
 def update_memory(memory: Any, u: Any, nominal: Any, interval: Any) -> Any:
     """The mean pull speed above the recipe's after an interval."""
-    mean = cost.moved_mean(memory.v_p_mean, u.v_p - nominal.v_p, interval)
+    mean = moved_mean(memory.v_p_mean, u.v_p - nominal.v_p, interval)
     return StepMemory(mean, memory.stop, 0.0 * memory.load_cell)
 
 
 @jittable
 def draw_load_cell_noise(slot: Any) -> None:
     """The load cell's noise, from the stream of the episode's start, which nothing else draws from once it runs."""
-    slot.load_cell = signals.LOAD_CELL_NOISE * slot.episode.camera_sd * normal(slot.streams[_START])
+    slot.load_cell = signals.LOAD_CELL_NOISE * slot.episode.camera_sd * normal(slot.streams[recipe.START])
 
 
 @jittable
@@ -184,7 +162,7 @@ def cost_inputs(x: Any, u: Any, before: Any, memory: Any, slot: Any, t: Any) -> 
     """True radius error less what no sensor shows [m], mean pull speed above the recipe's, steps of both drives."""
     p, e = slot.puller, slot.episode
     error = x.r_c - shape_at(x.L, p, e).r + bias_offset(t, e)
-    return cost.Cost(error, memory.v_p_mean / p.v_0, u.v_p - before.v_p, u.Q_H - before.Q_H)
+    return Cost(error, memory.v_p_mean / p.v_0, u.v_p - before.v_p, u.Q_H - before.Q_H)
 
 
 def points(p: Any) -> list[tuple[CrystalState, Inputs, Disturbance]]:
@@ -193,7 +171,7 @@ def points(p: Any) -> list[tuple[CrystalState, Inputs, Disturbance]]:
     return [
         (
             CrystalState(wide * p.r_0, high * p.h_0, p.T_1_0 + warm, p.T_2_0 + warm, p.T_b_0 + 0.2 * warm,
-                         share * task.end(p), 0.02 + share, 0.7 * share * p.M_0, 1.0 - 0.6 * share),
+                         share * recipe.end(p), 0.02 + share, 0.7 * share * p.M_0, 1.0 - 0.6 * share),
             Inputs(wide * p.v_0, high * p.Q_H_0),
             Disturbance(100.0 * warm, 0.1 * warm),
         )
@@ -201,7 +179,7 @@ def points(p: Any) -> list[tuple[CrystalState, Inputs, Disturbance]]:
     ]  # fmt: skip
 
 
-CRYSTAL = Process(
+CRYSTAL = BODY._replace(
     Constants=plant.Crystal,
     State=CrystalState,
     Disturbance=Disturbance,
@@ -209,28 +187,21 @@ CRYSTAL = Process(
     TrueState=signals.TrueState,
     Logged=signals.Logged,
     BriefInfo=signals.BriefInfo,
-    Cost=cost.Cost,
-    past=signals.PAST,
     relative=signals.RELATIVE,
     check=check,
     derive=plant.derive,
     begin=begin,
     nominal=nominal,
-    hidden_load=hidden_load,
     disturb=disturb,
     rates=plant.rates,
-    accept=task.accept,
+    accept=recipe.accept,
     perfect_readings=perfect_readings,
     measure=signals.measure,
     true_state=signals.true_state,
-    logged=logged,
-    brief_info=brief_info,
+    logged=signals.logged,
+    brief_info=signals.brief_info,
     cost_inputs=cost_inputs,
-    cost_terms=cost.cost_terms,
-    cost_slopes=cost.cost_slopes,
-    reward=cost.reward,
     points=points,
-    weights=cost.WEIGHTS,
     StepMemory=StepMemory,
     update_memory=update_memory,
     draw_sensor_noise=draw_load_cell_noise,
@@ -241,6 +212,7 @@ CRYSTAL = Process(
     apart=APART,
     duration=duration,
 )
+"""The body's process with a recipe: the same drives, sensors and cost."""
 ENVIRONMENTS = {each.name: each for each in (BODY, CRYSTAL)}
 """The processes by the names of their environments."""
 

@@ -298,7 +298,8 @@ AFTER_CROWN, BEFORE_TAIL = 60.0 * MM, 50.0 * MM
 """Length of body that the stage "crown" ends with, and that the stage "tail" begins with [m]."""
 SHORTEST_CHANGE = 0.05
 """Least share of the body over which a reference changes [-]."""
-_START = int(Stream.START)
+START = int(Stream.START)
+"""The random stream of the episode's start, of which the stage is drawn."""
 _LOW, _JUMP = 5.0 * MM, 1.2 * MM
 
 
@@ -344,7 +345,7 @@ def span(stage: Any, u: Any, table: Any, p: Any) -> Any:
 def draw_stage(slot: Any) -> Any:
     """Number of the stage that the episode grows, and a number in [0, 1) for where it begins."""
     p = slot.puller
-    u, v = uniform(slot.streams[_START]), uniform(slot.streams[_START])
+    u, v = uniform(slot.streams[START]), uniform(slot.streams[START])
     stage = 0
     for upto in (p.crown, p.crown + p.body, p.crown + p.body + p.tail):
         stage += 1 if u >= upto else 0
@@ -393,12 +394,12 @@ def within_limits(x: Any, r_ref: Any, limit: Any, p: Any) -> Any:
     return radius & meniscus & (x.T_b >= p.T_m)
 
 
-WAYS = ("frozen", "detached", "off", "cold")
+FAILURE_MODES = ("frozen", "detached", "off", "cold")
 """Ways to lose a crystal: meniscus too low, meniscus too high, radius too far off, melt below its melting point."""
 
 
-def room(at: Any, limit: Any, q: Any) -> Any:
-    """Relative distance of logged signals to the limit of each of :data:`WAYS`; the least one says how it was lost.
+def relative_margin(at: Any, limit: Any, q: Any) -> Any:
+    """Relative distance of logged signals to the limit of each of :data:`FAILURE_MODES`; the least one names the loss.
 
     After an impossible jump the state is the one before, which is still within all limits. ``limit`` is the largest
     radius error of the body [m], q the parameters.

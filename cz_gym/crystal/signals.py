@@ -9,19 +9,20 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.body.signals import PAST as PAST
+from cz_gym.body import signals as body
 from cz_gym.body.signals import outside
 from cz_gym.jit import jittable
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.schedule import bias_offset, drift
 from cz_gym.process import DONE, HEATER_SCALE, PULL_SCALE, Relative, read_drives, signals
 from cz_gym.process import Channel as Channel
-from cz_gym.support.units import KILO, MINUTE, MM
+from cz_gym.support.units import MINUTE, MM
 
 from . import recipe
-from .plant import meniscus_mass
+from .plant import CrystalState, Disturbance, at_interface, meniscus_mass
 from .recipe import end, height_inside, shape_at, value
 
+_MEASURED, _STATE, _LOGGED = map(signals, (body.Measured, body.TrueState, body.Logged))
 NEAR, FAR = 5.0 * MM, 25.0 * MM
 """Lengths ahead for which the recipe is observed [m]."""
 CONSTANT_ERROR, WAVE_ERROR, WAVELENGTH = 1.36, 1.28, 0.3
@@ -63,7 +64,7 @@ def later(L: Any, by: Any, p: Any) -> Any:
 
 
 class Measured(NamedTuple):
-    """What a puller's control computer knows, in SI units; arrays of the batch's shape where decoded.
+    """Readings and recipe in a puller's control computer, in SI units; arrays of the batch's shape where decoded.
 
     Radii count from r_0, temperatures and the recipe's drives from the body's operating point.
     """
@@ -71,7 +72,7 @@ class Measured(NamedTuple):
     ring_error: Annotated[
         Any, Channel("m", MM, "camera reading minus the recipe's ring at this length; the last valid one while invalid")
     ]
-    valid: Annotated[Any, Channel("1", 1.0, "1 if the camera says this reading is good, else 0")]
+    valid: Annotated[Any, _MEASURED["valid"]]
     r_ref: Annotated[Any, Channel("m", _R, "radius reference minus r_0, at this length")]
     r_ref_5mm: Annotated[Any, Channel("m", _R, "the same 5 mm later")]
     r_ref_25mm: Annotated[Any, Channel("m", _R, "the same 25 mm later")]
@@ -81,7 +82,7 @@ class Measured(NamedTuple):
     T_1: Annotated[Any, Channel("K", _T, "pyrometer reading minus nominal")]
     v_p: Annotated[Any, Channel("m/s", PULL_SCALE, "applied pull speed minus the recipe's; the scale is v_0")]
     Q_H: Annotated[Any, Channel("W", HEATER_SCALE, "applied heater power minus the recipe's")]
-    v_p_mean: Annotated[Any, Channel("m/s", 0.05 * PULL_SCALE, "exponential 30 min mean of v_p; the scale is v_0 / 20")]
+    v_p_mean: Annotated[Any, _MEASURED["v_p_mean"]]
     alpha_ref: Annotated[Any, Channel("rad", 0.5, "cone angle of the recipe")]
     L: Annotated[Any, Channel("m", 0.2, "length grown since the crown began")]
     v_p_ref: Annotated[Any, Channel("m/s", PULL_SCALE, "the recipe's pull speed minus v_0; the scale is v_0")]
@@ -141,10 +142,10 @@ class TrueState(NamedTuple):
     v_p_ref: Annotated[Any, _SHARED["v_p_ref"]]
     Q_H_ref: Annotated[Any, _SHARED["Q_H_ref"]]
     M_s: Annotated[Any, Channel("kg", 0.5, "true mass of the crystal minus the recipe's at this length")]
-    dT_i: Annotated[Any, Channel("K", 1.0, "interface fluctuation now")]
-    Q_d: Annotated[Any, Channel("W", KILO, "heat load on the melt now")]
-    ring_offset: Annotated[Any, Channel("m", MM, "offset of the ring that no sensor shows")]
-    lam: Annotated[Any, Channel("1", 1.0, "share of conduction: 1 is Model I, 0 is Model II")]
+    dT_i: Annotated[Any, _STATE["dT_i"]]
+    Q_d: Annotated[Any, _STATE["Q_d"]]
+    ring_offset: Annotated[Any, _STATE["ring_offset"]]
+    lam: Annotated[Any, _STATE["lam"]]
 
 
 @jittable
@@ -179,37 +180,37 @@ def true_state(slot: Any, measured: Any, t: Any) -> Any:
 class Logged(NamedTuple):
     """The entries of a step's ``info``, in SI units."""
 
-    r_c: Annotated[Any, Channel("m", 1.0, "true crystal radius")]
-    r_br: Annotated[Any, Channel("m", 1.0, "true radius of the bright ring")]
+    r_c: Annotated[Any, _LOGGED["r_c"]]
+    r_br: Annotated[Any, _LOGGED["r_br"]]
     r_ref: Annotated[Any, Channel("m", 1.0, "radius reference at this length")]
     L: Annotated[Any, Channel("m", 1.0, "length grown since the crown began")]
-    h_c: Annotated[Any, Channel("m", 1.0, "true meniscus height")]
+    h_c: Annotated[Any, _LOGGED["h_c"]]
     h_ref: Annotated[Any, Channel("m", 1.0, "meniscus height of the recipe")]
-    alpha_c: Annotated[Any, Channel("rad", 1.0, "cone angle of the crystal's wall")]
-    v_g: Annotated[Any, Channel("m/s", 1.0, "growth rate")]
+    alpha_c: Annotated[Any, _LOGGED["alpha_c"]]
+    v_g: Annotated[Any, _LOGGED["v_g"]]
     v_p: Annotated[Any, Channel("m/s", 1.0, "applied pull speed relative to the melt's surface")]
     v_p_ref: Annotated[Any, Channel("m/s", 1.0, "pull speed of the recipe")]
-    Q_H: Annotated[Any, Channel("W", 1.0, "applied heater power")]
+    Q_H: Annotated[Any, _LOGGED["Q_H"]]
     Q_H_ref: Annotated[Any, Channel("W", 1.0, "heater power of the recipe")]
     v_p_mean: Annotated[Any, Channel("m/s", 1.0, "exponential 30 min mean of v_p - v_p_ref")]
-    T_1: Annotated[Any, Channel("K", 1.0, "true heater temperature")]
+    T_1: Annotated[Any, _LOGGED["T_1"]]
     T_1_ref: Annotated[Any, Channel("K", 1.0, "recipe of the heater temperature, as it is given")]
-    T_b: Annotated[Any, Channel("K", 1.0, "true melt temperature")]
+    T_b: Annotated[Any, _LOGGED["T_b"]]
     M_s: Annotated[Any, Channel("kg", 1.0, "true mass of the crystal, its neck included")]
     weight: Annotated[Any, Channel("N", 1.0, "the load cell's reading, with noise")]
     H: Annotated[Any, Channel("m", 1.0, "depth of the melt in the crucible, which the lift follows")]
     v_over_G: Annotated[Any, Channel("1", 1.0, "v/G, growth rate by temperature gradient, relative to the recipe's")]
     dopant: Annotated[Any, Channel("1", 1.0, "dopant that the crystal takes up, relative to its first part's")]
-    r_br_measured: Annotated[Any, Channel("m", 1.0, "the camera's reading, with noise and offset")]
-    ring_offset: Annotated[Any, Channel("m", 1.0, "offset of the ring that no sensor shows")]
-    term_radius: Annotated[Any, Channel("1", 1.0, "the reward's term of the radius error")]
-    term_pull: Annotated[Any, Channel("1", 1.0, "the reward's term of the mean pull speed")]
-    term_pull_step: Annotated[Any, Channel("1", 1.0, "the reward's term of the step of the pull speed")]
-    term_heater_step: Annotated[Any, Channel("1", 1.0, "the reward's term of the step of the heater power")]
+    r_br_measured: Annotated[Any, _LOGGED["r_br_measured"]]
+    ring_offset: Annotated[Any, _LOGGED["ring_offset"]]
+    term_radius: Annotated[Any, _LOGGED["term_radius"]]
+    term_pull: Annotated[Any, _LOGGED["term_pull"]]
+    term_pull_step: Annotated[Any, _LOGGED["term_pull_step"]]
+    term_heater_step: Annotated[Any, _LOGGED["term_heater_step"]]
     cost: Annotated[Any, Channel("1", 1.0, "1 if |r_c - r_ref| > 0.5 mm or v_p_mean is more than 3 % of v_0, else 0")]
     stage: Annotated[Any, Channel("1", 1.0, "0 crown, 1 body, 2 tail, by the length")]
     succeeded: Annotated[Any, Channel("bool", 1.0, "whether the length was reached")]
-    action_clipped: Annotated[Any, Channel("bool", 1.0, "whether the action lay outside its box")]
+    action_clipped: Annotated[Any, _LOGGED["action_clipped"]]
 
 
 @jittable
@@ -234,9 +235,12 @@ def part_at(L: Any, p: Any) -> Any:
 
 
 @jittable
-def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, at: Any) -> Any:
-    """:class:`Logged` of a slot at its sample's time t [s]; ``ring`` [m] is the true bright ring."""
+def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, m: Any) -> Any:
+    """:class:`Logged` of a slot at its sample's time t [s], growth taken at a height within the limits; ``ring`` [m] is
+    the true bright ring."""
     p, x, L = slot.puller, slot.x, slot.x.L
+    inside = CrystalState(x.r_c, height_inside(x.h_c, p), x.T_1, x.T_2, x.T_b, L, x.A_s, x.M_s, x.N)
+    at = at_interface(inside, Disturbance(slot.Q_d, slot.dT_i), p, m.slope)
     now, Phi_s = shape_at(L, p, slot.episode), value(L, slot, recipe._Phi_s)
     left = (p.M_0 - x.M_s) / p.M_0
     return Logged(
@@ -281,6 +285,13 @@ class BriefInfo(NamedTuple):
     r_ref: Any
     cost: Any
     succeeded: Any
+
+
+@jittable
+def brief_info(slot: Any, measured: Any) -> Any:
+    """True radius, its reference, whether the crystal is out of tolerance, and whether it is long enough."""
+    r_ref = slot.puller.r_0 + measured.r_ref
+    return BriefInfo(slot.x.r_c, r_ref, out_of_tolerance(slot, measured), succeeded(slot))
 
 
 RELATIVE = (

@@ -1,4 +1,7 @@
-"""The number of processors that a process may use."""
+"""A batch of slots: the arrays, the draws at reset and the compiled step, on several threads if large.
+
+The scalar environment is a batch of one; both environments are thin shells over :class:`Batch`.
+"""
 
 import math
 import os
@@ -25,7 +28,7 @@ from cz_gym.spaces import drives_of, lags, observations
 from cz_gym.support.errors import CzError
 
 from .kernels import build_kernels
-from .slots import BatchConstants, BufferPool, ObservationScales, Out, SlotMemory, info_width, slot_type
+from .slots import BatchConstants, ObservationScales, Out, SlotMemory, info_width, slot_type
 
 
 def processors() -> int:
@@ -35,10 +38,6 @@ def processors() -> int:
         return counts.process_cpu_count() or 1
     return len(counts.sched_getaffinity(0)) if hasattr(counts, "sched_getaffinity") else os.cpu_count() or 1
 
-
-# A batch of slots: the arrays, the draws at reset and the compiled step, on several threads if large.
-#
-# The scalar environment is a batch of one; both environments are thin shells over this class.
 
 SLOTS_PER_THREAD, SLOTS_AT_ONCE = 256, 128
 """Least slots per thread in a step, and slots that a thread takes at once."""
@@ -75,7 +74,7 @@ class SlotState:
 class Batch:
     """The slots of ``num_envs`` crystals with the same settings, and the compiled loops over them.
 
-    The arrays of :meth:`new_out` are never written again while anything refers to them.
+    Each step writes into new arrays (:meth:`new_out`): those of earlier steps never change.
     """
 
     def __init__(self, config: Config, num_envs: int, threads: int | None = None, everything: bool = True) -> None:
@@ -115,10 +114,6 @@ class Batch:
         self._parameters = type(config.parameters)(*map(float, config.parameters))
         self.actions = np.zeros((num_envs, 2))
         self._all = np.ones(num_envs, np.bool_)
-        self._observations = BufferPool((num_envs, self.channels), np.float32)
-        self._states = BufferPool((num_envs, self.state_channels), np.float32)
-        self._images = BufferPool((num_envs, *IMAGE) if self._camera else (num_envs, 0, 0, 0), np.uint8)
-        self._infos = BufferPool((len(process.info), info_width(num_envs)), np.float64)
         out, which, keys = self.new_out(), np.zeros(1, np.int64), np.zeros((1, 2), np.uint64)
         stepped = (self.memory, self.actions, self._all, self.fixed, self.drives, self.scales, out, 0, 1)
         drawn = self._drawing(which, keys, self._lots, out)
@@ -133,16 +128,16 @@ class Batch:
         self._owner = os.getpid()
 
     def new_out(self) -> Out:
-        """New arrays for the results of a step, in memory that nothing else refers to."""
+        """New arrays for the results of a step."""
         n = self.num_envs
         return Out(
-            self._observations.new(),
-            self._states.new(),
-            self._images.new(),
+            np.empty((n, self.channels), np.float32),
+            np.empty((n, self.state_channels), np.float32),
+            np.empty((n, *(IMAGE if self._camera else (0, 0, 0))), np.uint8),
             np.empty(n),
             np.empty(n, np.bool_),
             np.empty(n, np.bool_),
-            self._infos.new(),
+            np.empty((len(self.config.process.info), info_width(n))),
         )
 
     def shown(self, out: Out) -> npt.NDArray[Any]:

@@ -1,4 +1,8 @@
-"""Output of a slot's signals: scaled channels, the memory of "history", the rows of ``info``."""
+"""The compiled loops: draws, drives, plant, sensors, observation and reward, for one slot or ten thousand.
+
+The equations are the functions of a :class:`cz_gym.process.Process`, compiled in; this module calls them in order for
+each slot, and turns its signals into scaled channels, the memory of "history" and the rows of ``info``.
+"""
 
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -70,11 +74,6 @@ def write_history(slot: Any, measured: Any, history: Any, scales: Any, out: Any,
         difference = measured[place] - measured[to]
         out[place] = clip(difference * (scales.measured[place] * process.relative_change[row]), CLIP)
 
-
-# The compiled loops: draws, drives, plant, sensors, observation and reward, for one slot or ten thousand.
-#
-# The equations are the functions of a :class:`cz_gym.process.Process`, compiled in; this module calls them in order
-# for each slot.
 
 TRIES = 100
 """Largest number of draws of a puller, all from one stream, until one has an operating point."""

@@ -1,4 +1,4 @@
-"""The drives of a slot: pull speed and heater power, moved by actions within their ranges and rates."""
+"""One control interval of a slot: drives moved by an action, camera and pyrometer, the plant of eight in lockstep."""
 
 from typing import Any
 
@@ -44,7 +44,7 @@ def next_inputs(x: Any, u: Any, action: Any, before: Any, drives: Any, slot: Any
 
 @jittable
 def drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any, process: Any) -> None:
-    """Move the drives by an action, the heater in whole steps, and with them what the process carries on."""
+    """Move the drives by an action, the heater in whole steps, and the process's ``StepMemory`` with them."""
     e, x = slot.episode, labelled(process.State, slot.x)
     slot.v_p_before, slot.Q_H_before = slot.v_p, slot.Q_H
     slot.clipped = 1.0 if (np.abs(pull) > 1.0 or np.abs(heat) > 1.0) else 0.0
@@ -61,7 +61,7 @@ def drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any, process: 
 
 @force_inlined
 def is_slow(e: Any) -> Any:
-    """Whether the power that heats is not simply the one that was set."""
+    """Whether the heater has a lag or dead time."""
     return e.heater_lag + e.heater_dead_time > 0.0
 
 

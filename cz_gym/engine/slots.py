@@ -1,16 +1,9 @@
-"""A pool of memory for the arrays that a step returns; a block is reused once nothing refers to it.
+"""The arrays of the compiled loops: the memory of a slot, the constants of a step and its results."""
 
-Large new arrays come as untouched pages, and writing those for the first time costs a good part of a step.
-"""
-
-import ctypes
-import math
-import weakref
 from functools import cache
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from cz_gym.episodes.draw import FREEZES, Episode, Stream
 from cz_gym.episodes.rng import WORDS
@@ -18,65 +11,6 @@ from cz_gym.jit import static
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.process import Inputs, Process, Readings
 from cz_gym.support.errors import CzError
-
-SPARES = 3
-"""Most free blocks that a pool holds."""
-_ALIGNED = 64
-_LARGE = 1 << 14
-"""Arrays below this size [B] are made anew: the allocator keeps such memory itself."""
-Block = npt.NDArray[np.uint8]
-
-
-class _Use(weakref.ref[Any]):
-    """A weak reference to the buffer around a block; its callback returns the block to the pool."""
-
-    __slots__ = ("block",)
-    block: Block
-
-
-class BufferPool:
-    """Arrays of one shape and type, on blocks of memory that are reused when no reference to them is left.
-
-    An array's base is a buffer made for it alone. The array, its views, memory views, tensors and pointers made from
-    them, in any thread, all hold a reference to that buffer, as they would to an array's own memory. When the last
-    one is gone, the block returns to the pool.
-    """
-
-    def __init__(self, shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
-        self._shape, self._dtype = shape, np.dtype(dtype)
-        size = math.prod(shape) * self._dtype.itemsize
-        self._type = ctypes.c_byte * size if size >= _LARGE else None
-        self._free: list[Block] = []
-        self._in_use: dict[int, _Use] = {}
-
-    def new(self) -> npt.NDArray[Any]:
-        """An array with arbitrary content."""
-        if self._type is None:
-            return np.empty(self._shape, self._dtype)
-        try:
-            block = self._free.pop()
-        except IndexError:
-            block = _block(ctypes.sizeof(self._type))
-        view: Any = self._type.from_buffer(cast(Any, block))
-        use = _Use(view, self._return)
-        use.block = block
-        self._in_use[id(use)] = use
-        return np.ndarray(self._shape, self._dtype, view)
-
-    def _return(self, use: _Use) -> None:
-        del self._in_use[id(use)]
-        if len(self._free) < SPARES:
-            self._free.append(use.block)
-
-
-def _block(size: int) -> Block:
-    """Memory that begins at a cache line."""
-    memory = np.empty(size + _ALIGNED, np.uint8)
-    start = -memory.ctypes.data % _ALIGNED
-    return memory[start : start + size]
-
-
-# The arrays of the compiled loops: the memory of a slot, the constants of a step and its results.
 
 
 def _record(kind: Any) -> np.dtype[Any]:
@@ -127,7 +61,7 @@ def slot_type(process: Process) -> np.dtype[Any]:
 
 @static
 class Model(NamedTuple):
-    """What is compiled into the loops: a process on a meniscus, and where its numbers stand (:func:`model_of`)."""
+    """A process on a meniscus, compiled into the loops, and the places of its numbers (:func:`model_of`)."""
 
     process: Process
     meniscus: MeniscusModel
@@ -153,9 +87,9 @@ class Model(NamedTuple):
     """Row of the substep [s] in a lane; then the time that is reached [s], and whether the slot goes on."""
     lane_rows: int
     memory_at: int
-    """Place in the differentiable state of what the process carries on; number of states and inputs."""
+    """Place of ``StepMemory`` in the differentiable state; number of states and inputs."""
     memories: int
-    """Number of what the process carries on."""
+    """Number of fields of ``StepMemory``."""
     nominal: int
     """Place of the nominal inputs in the differentiable state."""
     nominals: int
@@ -169,15 +103,15 @@ class Model(NamedTuple):
     costs: int
     """Number of terms of the cost."""
     driven_by: int
-    """Number of what the next inputs depend on: state, inputs, actions, the nominal inputs before."""
+    """Columns of the next inputs' derivatives: state, inputs, actions, the nominal inputs before."""
     memory_by: int
-    """Number of what the carried numbers depend on: themselves, the inputs, the nominal ones."""
+    """Columns of the derivatives of ``StepMemory``: itself, the inputs, the nominal ones."""
     cost_by: int
-    """Number of what the cost depends on: state, inputs and those before, what is carried on."""
+    """Columns of the cost's derivatives: state, inputs and those before, ``StepMemory``."""
     channels: int
     """Number of channels of "measured"."""
     shown_by: int
-    """Number of what these depend on: state, inputs, the nominal ones, what is carried on, readings."""
+    """Columns of their derivatives: state, inputs, the nominal ones, ``StepMemory``, readings."""
 
 
 @cache
@@ -200,7 +134,7 @@ def model_of(process: Process, meniscus: MeniscusModel) -> Model:
 
 
 class BatchConstants(NamedTuple):
-    """What all slots share and no step changes: time base, radius limit, weights of the cost, logged series."""
+    """Constants that all slots share and no step changes: time base, radius limit, cost weights, logged series."""
 
     interval: float
     """Control interval [s]."""
@@ -265,7 +199,7 @@ class ObservationScales(NamedTuple):
     share: Any
     """One over the number of samples in each span, shape (lags,)."""
     everything: bool
-    """Whether all of ``info`` is written; otherwise only the rows of ``BriefInfo`` and ``action_clipped``."""
+    """True: all of ``info`` is written; false: the rows of ``BriefInfo`` and ``action_clipped``."""
 
 
 INFO_CHOICES = ("lean", "all")

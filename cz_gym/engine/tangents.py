@@ -1,8 +1,9 @@
 """Derivatives of a step, by complex steps through its own functions and the chain rule.
 
 The differentiable state of a slot is :func:`smooth`; :func:`build_tangents` compiles the loop that writes the
-derivatives of the next state and of the cost by this state and by the action. f'(x) = Im f(x + i h) / h, without
-subtraction, so h can be arbitrarily small (Squire and Trapp, SIAM Review 1998).
+derivatives of the next state and of the cost by this state and by the action, and :class:`DifferentiableBatch` is the
+batch that calls it. f'(x) = Im f(x + i h) / h, without subtraction, so h can be arbitrarily small (Squire and Trapp,
+SIAM Review 1998).
 """
 
 from collections.abc import Sequence
@@ -27,7 +28,7 @@ from cz_gym.support.errors import CzError
 
 from .batch import Batch, first_key
 from .loop import next_inputs
-from .slots import BufferPool, Out, model_of
+from .slots import Out, model_of
 
 ACTIONS = 2
 _H = 2.0**-100
@@ -38,7 +39,7 @@ _INPUTS = len(Inputs._fields)
 
 def smooth(process: Process) -> tuple[str, ...]:
     """Names of the differentiable state: the plant's; pull speed [m/s] and heater power [W], the latter before it is
-    rounded to whole steps; what the process carries on; the nominal drives, where they move; the bright ring [m], and
+    rounded to whole steps; the process's ``StepMemory``; the nominal drives, where they move; the bright ring [m], and
     the camera's reading of it without the operator's bias [m]."""
     nominal = tuple(f"{name}_nominal" for name in Inputs._fields) if process.nominal_moves else ()
     return (*process.State._fields, *Inputs._fields, *process.StepMemory._fields, *nominal, "ring", "reading")
@@ -143,7 +144,7 @@ def _after(work: Any) -> None:
 
 @jittable
 def _through_drives(by: Any, J: Any, j: Any, model: Any) -> Any:
-    """Derivative by number j of what depends so on plant state and applied inputs at the begin of the step."""
+    """Derivative by z_j of a quantity with these partials in plant state and inputs, both at the start of the step."""
     direct = by[j] if j < model.states else 0.0
     return direct + by[model.states] * J[model.states, j] + by[model.states + 1] * J[model.states + 1, j]
 
@@ -174,7 +175,7 @@ def _drives_by(
 
 @jittable
 def _memory_by(J: Any, slot: Any, step_memory: Any, interval: Any, model: Any) -> None:
-    """Derivatives of what the process carries on, from those of the inputs and the nominal ones."""
+    """Derivatives of ``StepMemory``, from those of the inputs and the nominal ones."""
     if model.memories > 0:
         by, process = scratch(model.memories, model.memory_by), model.process
         nominal = Inputs(slot.v_p_nominal, slot.Q_H_nominal)
@@ -341,8 +342,6 @@ def build_tangents(process: Process, meniscus: MeniscusModel) -> tuple[Any, ...]
 
 
 # A batch whose step has derivatives: gradients of a cost through a crystal, for learning, identification, shooting.
-#
-# The plant is the environment's own; nothing is approximated (:mod:`cz_gym.engine.tangents`).
 
 Floats = npt.NDArray[np.float64]
 
@@ -412,10 +411,9 @@ class DifferentiableBatch:
         self.grows, self._begun = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
         """Whether each crystal grew in the last step, and whether each slot has one, shape (n,)."""
         self._work = np.zeros(work_shape(config.process))
-        self._jacobians = BufferPool((self.num_envs, len(rows(config.process)), len(self._names) + ACTIONS), np.float64)
+        self._jacobian = self.num_envs, len(rows(config.process)), len(self._names) + ACTIONS
         shows = len(config.process.measured), len(self._names)
         self._moves = config.process.nominal_moves
-        self._shows = BufferPool((self.num_envs if self._moves else 1, *shows), np.float64)
         self.measured_by_state: Floats = np.zeros(shows)
         """Derivatives of the last "measured" observation by the last state, shape (12, 10), the same for all slots and
         steps; (n, 17, 17) on CzCrystal-v0, where references run with the length. Zero before the first reset, and for a
@@ -465,7 +463,7 @@ class DifferentiableBatch:
         self.grows = active & ~out.terminated
         self._out = out
         self._update_state()
-        jacobian = self._jacobians.new()
+        jacobian = np.empty(self._jacobian)
         step = (held, batch.actions, self.grows, batch.fixed, batch.drives)
         self._tangents(batch.memory, before, *step, self._work, jacobian, 0, n)
         info = out.info[:, :n]
@@ -484,7 +482,8 @@ class DifferentiableBatch:
         """Read the slots' states, and how observations depend on them."""
         self._state = self._now()
         if self._moves or first:
-            shown, batch = self._shows.new(), self._batch
+            batch, shape = self._batch, self.measured_by_state.shape[-2:]
+            shown = np.empty((self.num_envs if self._moves else 1, *shape))
             self._shown(batch.memory, batch.scales.measured, batch.fixed.interval, shown, 0, len(shown))
             shown[~self.grows[: len(shown)]] = 0.0  # those of a lost crystal may be infinite
             self.measured_by_state = shown if self._moves else shown[0]

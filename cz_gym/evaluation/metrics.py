@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from cz_gym.body.signals import COST_CAP, PULL_TOLERANCE, TOLERANCE, moved_mean
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.crystal.recipe import CONE_LIMIT, WAYS, room
+from cz_gym.crystal.recipe import CONE_LIMIT, FAILURE_MODES, relative_margin
 from cz_gym.process import Process
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
@@ -243,7 +243,9 @@ def crystal_metrics(run: Rollout) -> CrystalMetrics:
     error, limit = np.abs(s.r_c - s.r_ref), CONE_LIMIT * run.config.radius_limit
     lost_in = np.where(run.failed, s.stage[last, every], np.nan)
     ends = type(s)(*(signal[last, every] for signal in s))
-    how = np.where(run.failed, np.argmin(room(ends, run.config.radius_limit, run.config.parameters), axis=0), -1)
+    how = np.where(
+        run.failed, np.argmin(relative_margin(ends, run.config.radius_limit, run.config.parameters), axis=0), -1
+    )
     grown = np.maximum(np.diff(s.L, axis=0, prepend=run.start.L), 0.0) * body
     v_over_G = np.abs(_mean(s.v_over_G, dt) - 1.0)
     return CrystalMetrics(
@@ -259,7 +261,7 @@ def crystal_metrics(run: Rollout) -> CrystalMetrics:
         dopant_spread=_most(s.dopant, body) / -_most(-s.dopant, body) - 1.0,
         completed=_most(s.succeeded, run.alive),
         **{f"lost_in_{part}": (lost_in == number).astype(np.float64) for number, part in enumerate(PARTS)},
-        **{way: (how == number).astype(np.float64) for number, way in enumerate(WAYS)},
+        **{way: (how == number).astype(np.float64) for number, way in enumerate(FAILURE_MODES)},
     )
 
 

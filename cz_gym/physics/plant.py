@@ -61,7 +61,7 @@ class Growth(NamedTuple):
 
 
 class Heating(NamedTuple):
-    """What the heat flows of a puller do."""
+    """Rates of heater and crucible, and the heat that stays in the melt."""
 
     heater: Any
     """Rate of the heater's temperature [K/s]."""

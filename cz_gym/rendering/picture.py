@@ -88,7 +88,7 @@ class Record:
 
     @property
     def ring_bias(self) -> Any:
-        """What the operator takes off the ring [m]."""
+        """Bright ring minus radius by the operator's bias [m]."""
         return self.puller.ring_bias
 
     @property
@@ -171,8 +171,8 @@ class CrystalRecord(Record):
         if self.last("succeeded") > 0.0:
             return Ending.DONE
         at = self.config.process.Logged(*self._samples[self._count - 1, :-1])
-        rooms = recipe.room(at, self.config.radius_limit, self.config.parameters)
-        return (Ending.FROZEN, Ending.DETACHED, Ending.LOST, Ending.COLD)[int(np.argmin(rooms))]
+        margins = recipe.relative_margin(at, self.config.radius_limit, self.config.parameters)
+        return (Ending.FROZEN, Ending.DETACHED, Ending.LOST, Ending.COLD)[int(np.argmin(margins))]
 
 
 def record_for(config: Config, slot: Any, scenario: str) -> Record:

@@ -9,7 +9,7 @@ from cz_gym.baselines.policy import OpenLoop
 from cz_gym.config import make_config
 from cz_gym.crystal import recipe
 from cz_gym.crystal.process import CRYSTAL, nominal_recipe
-from cz_gym.crystal.recipe import WAYS, room
+from cz_gym.crystal.recipe import FAILURE_MODES, relative_margin
 from cz_gym.evaluation.metrics import KWH, CrystalMetrics, crystal_metrics, measured
 from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.evaluation.rollout import rollout
@@ -51,7 +51,7 @@ def test_the_nearest_limit_says_how_a_crystal_was_lost(changes, way):
     at = CRYSTAL.Logged(*[np.nan] * len(CRYSTAL.Logged._fields))._replace(
         **{"r_c": 87.5 * MM, "r_ref": 87.5 * MM, "h_c": 6.6 * MM, "L": 0.5, "T_b": 1690.0} | changes
     )
-    assert WAYS[int(np.argmin(room(at, LIMIT, make_config(process=CRYSTAL).parameters)))] == way
+    assert FAILURE_MODES[int(np.argmin(relative_margin(at, LIMIT, make_config(process=CRYSTAL).parameters)))] == way
 
 
 def test_a_frozen_crown_counts_once_and_with_the_largest_allowed_error():

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.crystal.recipe import WAYS
+from cz_gym.crystal.recipe import FAILURE_MODES
 from cz_gym.evaluation import plots
 from cz_gym.evaluation.metrics import PARTS
 from cz_gym.evaluation.plots import INK, canvas, chosen, example, lost, png, styles_of
@@ -96,7 +96,7 @@ def losses(result: Result) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         cells = []
         for part in PARTS:
             where = sample.metric(f"lost_in_{part}")
-            counts = {way: int((where * sample.metric(way)).sum()) for way in WAYS}
+            counts = {way: int((where * sample.metric(way)).sum()) for way in FAILURE_MODES}
             cells.append(", ".join(f"{number} {way}" for way, number in counts.items() if number) or NOTHING)
         lines.append((label(sample, result), *cells))
     return ("controller", *(f"lost in {part}" for part in PARTS)), lines

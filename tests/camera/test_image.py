@@ -116,35 +116,35 @@ def test_an_image_without_a_ring_reads_as_nan(detector):
     flat = picture(PULLER.r_0, 3e-3, PULLER, VIEW)
     for image in (np.zeros(IMAGE, np.uint8), np.full(IMAGE, 200, np.uint8), flat):
         assert math.isnan(detector.read(image).radius)
-    with pytest.raises(ValueError, match="no bright ring"):
-        RingDetector(make_view(Camera(aim=0.02)), PULLER)
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("call", "says"),
     [
-        ({"tilt": 1.6}, "tilt"),
-        ({"distance": 0.1}, "above the heat shield"),
-        ({"focal_length": 0.0}, "focal_length"),
-        ({"pixel_pitch": math.nan}, "pixel_pitch"),
-        ({"melt_emissivity": 1.2}, "must not exceed 1"),
-        ({"shield_radius": 0.05}, "opening"),
-        ({"wall_temperature": "hot"}, "wall_temperature"),
+        *(
+            (lambda change=change: check_camera(Camera()._replace(**change), Parameters()), says)
+            for change, says in (
+                ({"tilt": 1.6}, "tilt"),
+                ({"distance": 0.1}, "above the heat shield"),
+                ({"focal_length": 0.0}, "focal_length"),
+                ({"pixel_pitch": math.nan}, "pixel_pitch"),
+                ({"melt_emissivity": 1.2}, "must not exceed 1"),
+                ({"shield_radius": 0.05}, "opening"),
+                ({"wall_temperature": "hot"}, "wall_temperature"),
+            )
+        ),
+        (lambda: make_config(camera=Camera()), "observation"),
+        (lambda: make_config(observation="camera", camera=3), r"cz_gym\.camera\.Camera"),
+        (lambda: RingDetector(make_view(Camera(aim=0.02)), PULLER), "no bright ring"),
     ],
 )
-def test_impossible_cameras_are_refused_in_one_line(change, says):
+def test_impossible_cameras_are_refused_in_one_line(call, says):
     with pytest.raises(ValueError, match=says) as raised:
-        check_camera(Camera()._replace(**change), Parameters())
+        call()
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [({"camera": Camera()}, "observation"), ({"observation": "camera", "camera": 3}, r"cz_gym\.camera\.Camera")],
-)
-def test_a_camera_needs_the_camera_observation_and_changes_the_hash(arguments, says):
-    with pytest.raises(ValueError, match=says):
-        make_config(**arguments)
+def test_a_camera_changes_the_hash():
     assert len({make_config(observation="camera", camera=Camera(tilt=tilt)).hash for tilt in (0.3, 0.35)}) == 2
 
 
