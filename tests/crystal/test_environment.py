@@ -1,15 +1,10 @@
 """``CzCrystal-v0`` as an environment: checkers, batch, saved states, scenarios along a crystal, its end."""
 
-import pickle
-import warnings
 from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env as check_with_gymnasium
-from gymnasium.vector import AutoresetMode
-from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
 import cz_gym
 from cz_gym.crystal import signals
@@ -18,47 +13,9 @@ from cz_gym.episodes.scenarios import NOMINAL
 from cz_gym.physics.schedule import DRAW_SPAN
 from cz_gym.spaces import decode
 from cz_gym.support.units import HOUR, MM
-from tests.vector_checker import check_vector_env
 
 MIX = {"crown": 0.4, "body": 0.3, "tail": 0.3}
 PLAIN = {"observation": "measured", "action": "direct", "info": "all"}
-
-
-@pytest.mark.parametrize("observation", ["measured", "history", "state"])
-def test_the_checkers_of_gymnasium_and_stable_baselines3(observation):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gym.make("CzCrystal-v0", observation=observation, stage=MIX).unwrapped
-        check_with_gymnasium(env)
-        check_with_sb3(env)
-
-
-@pytest.mark.parametrize("mode", list(AutoresetMode))
-def test_the_batch_is_a_vector_of_scalars(mode):
-    settings = {"scenario": "all", "stage": MIX, "info": "all", "control_interval": 120.0, "horizon": 3600.0}
-    make = lambda n, mode: CzCrystalVectorEnv(n, autoreset_mode=mode, **settings)  # noqa: E731
-    checked = check_vector_env(make, lambda: CzCrystalEnv(**settings), mode=mode)
-    assert checked.episodes > checked.failures > 4
-
-
-def test_states_continue_bit_for_bit():
-    env = gym.make_vec(
-        "CzCrystal-v0", 4, vectorization_mode="vector_entry_point", scenario="puller", stage=MIX
-    ).unwrapped
-    env.reset(seed=1)
-    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (40, 4, 2)).astype(np.float32)
-    for action in actions[:20]:
-        env.step(action)
-    saved = pickle.loads(pickle.dumps(env.get_state()))
-    first = [env.step(action) for action in actions[20:]]
-    other = CzCrystalVectorEnv(4, scenario="puller", stage=MIX)
-    with pytest.raises(ValueError, match="saved under other settings"):
-        CzCrystalVectorEnv(4, scenario="puller", stage="tail").set_state(saved)
-    other.set_state(saved)
-    for (seen, gained, *_), action in zip(first, actions[20:], strict=True):
-        again = other.step(action)
-        np.testing.assert_array_equal(again[0], seen)
-        np.testing.assert_array_equal(again[1], gained)
 
 
 def test_where_stages_begin_and_end():

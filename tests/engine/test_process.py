@@ -3,6 +3,7 @@
 h' = v_p - v_0 sqrt(h/h_0) and T' = (Q_H - G (T - T_a) - Q_d) / C: the first drive fills it, the second heats it.
 """
 
+import pickle
 import warnings
 from dataclasses import replace
 from typing import Annotated, Any, NamedTuple
@@ -18,6 +19,7 @@ from stable_baselines3.common.env_checker import check_env as check_with_sb3
 from cz_gym import CzEnv, CzVectorEnv
 from cz_gym.body.signals import WEIGHTS, Cost, cost_slopes, cost_terms, reward
 from cz_gym.config import make_config
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.engine.tangents import DifferentiableBatch
 from cz_gym.evaluation.protocol import Case, Contender
 from cz_gym.evaluation.results import summarise
@@ -166,37 +168,53 @@ class Integrating:
         return np.clip(action, -1.0, 1.0).astype(np.float32), (total + level, level)
 
 
-def test_the_checkers_of_gymnasium_and_stable_baselines3():
+MIX = {"crown": 0.4, "body": 0.3, "tail": 0.3}
+BOTH = {"tank": {"process": TANK}, "crystal": {"process": CRYSTAL, "stage": MIX}}
+processes = pytest.mark.parametrize("given", BOTH.values(), ids=BOTH)
+
+
+@processes
+@pytest.mark.parametrize("observation", ["measured", "history", "state"])
+def test_the_checkers_of_gymnasium_and_stable_baselines3(observation, given):
+    kind, settings = ("Tank-v0", SETTINGS) if given["process"] is TANK else ("CzCrystal-v0", {"stage": MIX})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for observation in ("measured", "history", "state"):
-            env = gym.make("Tank-v0", observation=observation, **SETTINGS).unwrapped
-            check_with_gymnasium(env)
-            check_with_sb3(env)
+        env = gym.make(kind, observation=observation, **settings).unwrapped
+        check_with_gymnasium(env)
+        check_with_sb3(env)
 
 
+@processes
 @pytest.mark.parametrize("mode", list(AutoresetMode))
-def test_the_batch_is_a_vector_of_scalars(mode):
-    settings = {"process": TANK, "scenario": "all", "info": "all", "control_interval": 120.0, "horizon": 3600.0}
+def test_the_batch_is_a_vector_of_scalars(mode, given):
+    settings = {**given, "scenario": "all", "info": "all", "control_interval": 120.0, "horizon": 3600.0}
     make = lambda n, mode: CzVectorEnv(n, autoreset_mode=mode, **settings)  # noqa: E731
     checked = check_vector_env(make, lambda: CzEnv(**settings), mode=mode)
     assert checked.episodes > checked.failures > 4
 
 
-def test_states_continue_bit_for_bit_with_what_the_process_added():
-    env = gym.make_vec("Tank-v0", 3, vectorization_mode="vector_entry_point", **SETTINGS)
+@processes
+def test_states_continue_bit_for_bit_with_what_the_process_added(given):
+    settings = {**SETTINGS, **given} if given["process"] is TANK else {**given, "scenario": "puller"}
+    env = CzVectorEnv(4, **settings)
     env.reset(seed=1)
-    actions = np.random.default_rng(0).uniform(-0.2, 0.2, (20, 3, 2)).astype(np.float32)
-    for action in actions[:10]:
+    actions = np.random.default_rng(0).uniform(-0.2, 0.2, (40, 4, 2)).astype(np.float32)
+    for action in actions[:20]:
         env.step(action)
-    saved = env.unwrapped.get_state()
+    saved = pickle.loads(pickle.dumps(env.get_state()))
     slot = saved[0].slot.slot
-    assert slot["fed"] > 0.001
-    assert slot["table"].tolist() == [[0.0, 0.0], [1e4, 0.1], [2e4, 0.2]]
-    first = [env.step(action)[:2] for action in actions[10:]]
-    env.unwrapped.set_state(saved)
-    for (seen, gained), action in zip(first, actions[10:], strict=True):
-        again = env.step(action)
+    assert slot["table"].any()
+    if given["process"] is TANK:
+        assert slot["fed"] > 0.001
+        assert slot["table"].tolist() == [[0.0, 0.0], [1e4, 0.1], [2e4, 0.2]]
+    else:
+        with pytest.raises(ValueError, match="saved under other settings"):
+            CzVectorEnv(4, **{**settings, "stage": "tail"}).set_state(saved)
+    first = [env.step(action)[:2] for action in actions[20:]]
+    other = CzVectorEnv(4, **settings)
+    other.set_state(saved)
+    for (seen, gained), action in zip(first, actions[20:], strict=True):
+        again = other.step(action)
         np.testing.assert_array_equal(again[0], seen)
         np.testing.assert_array_equal(again[1], gained)
 
