@@ -31,20 +31,20 @@ from .tuned_pid import CONVENTIONAL, PROPORTIONAL, factors, scaled
 GAIN_MARGIN, PHASE_MARGIN = 2.5, 45.0
 """Least margins of the loop opened at the camera [-, degrees]; the gain may fall by as much as it may grow."""
 SPARE = 1.03
-"""What the search asks beyond them, because it looks at a grid of frequencies [-]."""
+"""Factor on the least margins in the search, because it looks at a grid of frequencies [-]."""
 CANDIDATES, FREQUENCIES = 500, 120
 MIDDLE = {
     "heater.K_pull": 8.9, "heater.T_pull": 550.0, "heater.T_mean": 195.0, "heater.K": 1000.0,
     "pid.T_i": 12_500.0, "pid.T_d": 560.0, "T_f": 5.5,
 }  # fmt: skip
-"""Where the search begins, for the default puller, from a search on 24 of its training crystals."""
+"""Start of the search for the default puller, from a search on 24 of its training crystals."""
 FIXED = {"heater.share": 1.0, "heater.T_i": 1500.0, "T_track": 3400.0, "T_start": 1500.0}
-"""Chosen on training crystals too. Without the whole recipe the ring would be off by its error; with a faster heater
-the power that is held when the pyrometer goes is far from its mean, which loses crystals."""
+"""Settings that the search leaves, chosen on training crystals. Without the whole recipe the ring would be off by its
+error; with a faster heater the power held when the pyrometer goes is far from its mean, which loses crystals."""
 GAINS = np.geomspace(3e-4, 8e-3, 20)
-"""Gains that it tries with all the rest, for the default puller [1/s]."""
+"""Gains tried with every candidate, for the default puller [1/s]."""
 STEP, STEP_PRICE = 0.02 * MM_PER_MIN, 0.003
-"""A pull step RMS of the default puller's, and its price."""
+"""A pull step RMS of the default puller [m/s], and its price [-]."""
 
 
 class Fallback(NamedTuple):
@@ -53,9 +53,9 @@ class Fallback(NamedTuple):
     pid: FilteredPID
     gain_margin: float
     phase_margin: float
-    """[degrees]"""
+    """Phase margin [degrees]."""
     latency: float
-    """Of the camera, which the margins include [s]."""
+    """Latency of the camera, which the margins include [s]."""
 
 
 class _Plant(NamedTuple):
@@ -108,7 +108,7 @@ def _searched(config: Config, latency: float, window: float, noise: float) -> Fa
 
 
 def _scaled(start: FilteredPID, values: dict[str, float], scale: dict[str, float]) -> FilteredPID:
-    """The settings with these ones, for the default puller, in proportion to this one."""
+    """A PID with these settings of the default puller, scaled to the config's puller."""
     of = {path: scale[name] for name, paths in PROPORTIONAL.items() for path in paths}
     own = {path: of.get(path, 1.0) * value for path, value in values.items()}
     settings: FilteredPID = with_values(replace(start, pid=SeriesPID(1.0, N=20.0)), own)
@@ -133,7 +133,7 @@ def _response(puller: Puller, config: Config, z: Any) -> Any:
 
 
 def _loop(pid: FilteredPID, config: Config, plant: _Plant) -> tuple[Any, Any, Any]:
-    """Of the camera: loop gain, its share that the PID is (pull speed for a reading), and the ring for a heat load."""
+    """Responses at the camera: the loop gain, the PID alone (pull speed for a reading), the ring for a heat load."""
     dt, z, G, heater = config.control_interval, plant.z, plant.G, pid.heater
     b_0, b_1, a_1 = pid.pid.lead(dt)
     lead, sum_ = (b_0 + b_1 / z) / (1.0 + a_1 / z), 1.0 / (1.0 - 1.0 / z)
@@ -171,7 +171,7 @@ def _priced(pid: FilteredPID, config: Config, plant: _Plant) -> Any:
 
 
 def margins_of(L: Any) -> tuple[float, float, float]:
-    """How far the gain of a loop may grow and fall [-], and its phase margin [degrees], on a grid of frequencies."""
+    """Factors by which a loop's gain may grow and fall [-], and its phase margin [degrees], on a frequency grid."""
     phase, gain = np.unwrap(np.angle(L)), np.log(np.abs(L))
     past = np.mod(phase, 2.0 * np.pi) - np.pi
     at = np.flatnonzero(((past[:-1] > 0.0) != (past[1:] > 0.0)) & (np.abs(np.diff(past)) < 1.0))

@@ -94,32 +94,36 @@ def study(controller: str, scenario: str, crystals: int) -> list[Row]:
     return rows
 
 
+def _named(rows: Sequence[Row]) -> str:
+    return ", ".join(f"{row.controller} on {row.scenario} in {row.real}" for row in rows) or "none"
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    *names, difference, python, c, alone = row
+    triples = zip((".3f", ".4f", ""), python, c, alone or ("",) * 3, strict=True)
+    cells = (value if value == "" else f"{value:{form}}" for form, *triple in triples for value in triple)
+    return (*names, f"{difference:.1e}", *cells)
+
+
 def report(rows: Sequence[Row], crystals: int) -> str:
     """The verdict and the table."""
     worst = {real: max(row.difference for row in rows if row.real == real) for real in LARGEST}
     said = ", ".join(f"{worst[real]:.1e} in {real} (limit {limit:.0e})" for real, limit in LARGEST.items())
-
-    def which(chosen: Sequence[Row]) -> str:
-        return ", ".join(f"{row.controller} on {row.scenario} in {row.real}" for row in chosen) or "none"
-
+    above = _named([row for row in rows if row.difference > LARGEST[row.real]])
+    differing = _named([row for row in rows if row.python != row.c])
     heads = (each for name in ("RMSE [mm]", "pull step [mm/min]", "lost") for each in (name, "of C", "rounded"))
-    lines = []
-    for *names, difference, python, c, alone in rows:
-        triples = zip((".3f", ".4f", ""), python, c, alone or ("",) * 3, strict=True)
-        cells = (value if value == "" else f"{value:{form}}" for form, *triple in triples for value in triple)
-        lines.append((*names, f"{difference:.1e}", *cells))
     return f"""# Exported C beside Python
 
 {crystals} validation crystals of three hours a row. Largest difference of an action on the same readings, in shares of
 the drives' ranges: {said}.
 
-Actions above the limit: {which([row for row in rows if row.difference > LARGEST[row.real]])}.
+Actions above the limit: {above}.
 
-Rows of the table that differ: {which([row for row in rows if row.python != row.c])}.
+Rows of the table that differ: {differing}.
 Beside a row that differs stands, as "rounded", that of the C in double precision whose setpoints alone are rounded to
 single precision: so much the loop of crystal and controller makes of the seventh digit.
 
-{markdown(("controller", "scenario", "C", "action", *heads), lines)}
+{markdown(("controller", "scenario", "C", "action", *heads), map(_cells, rows))}
 """
 
 

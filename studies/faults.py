@@ -1,4 +1,4 @@
-"""What a block does with the trouble of a plant: ``python -m studies.faults``.
+"""Blocks under the faults of a plant: ``python -m studies.faults``.
 
 Every controller's block grows the same crystals without and with each fault: calls that come early, late or unevenly, a
 pyrometer that is gone for two hours, nominal values that are off, drives that stand still. The environment runs at half
@@ -38,7 +38,7 @@ SETTLED = 0.5 * HOUR
 
 
 class Fault(NamedTuple):
-    """What is done to a block between its plant and itself."""
+    """Changes to calls, readings, settings and drives between a plant and its block."""
 
     pace: Sequence[float] = (1.0,)
     """Times between calls in intervals of the block, multiples of a half, over and over."""
@@ -47,7 +47,7 @@ class Fault(NamedTuple):
     off: float = 0.0
     """Error of the nominal values, in multiples of OFF."""
     still: bool = False
-    """Whether the drives stand still for a while."""
+    """Whether the drives stand still during :data:`STILL`."""
 
 
 UNEVEN = tuple(np.random.default_rng(0).integers(1, 5, 997) / 2.0)
@@ -83,7 +83,7 @@ class Faulty:
         return self.runner.start(n)
 
     def run(self, inputs: Mapping[str, Any], memory: Any) -> Any:
-        """What the plant gets, and the next memory."""
+        """The setpoints that reach the plant, and the next memory."""
         time, self.time = self.time, self.time + 0.5 * self.dt
         if time < self.due - 1e-6:
             return self.held, memory

@@ -1,6 +1,6 @@
 """Controllers outside Python: C99 and IEC 61131-3 structured text, both written from one description.
 
-:mod:`.trace` records what a controller computes as a list of operations on numbers of fixed length. :mod:`.shell` puts
-limits, takeover, hold and fallback around it. :mod:`.program` runs the recorded operations in NumPy; :mod:`.text`
-writes them.
+:mod:`.shell` puts limits, takeover, hold, fallback and alarms around a controller, out of the parts in :mod:`.block`.
+:mod:`.trace` records a block as a list of operations on numbers of fixed length; :mod:`.writer` and :mod:`.text` write
+them. :mod:`.controllers` finds controllers and agents by name.
 """

@@ -1,4 +1,9 @@
-"""The ports of a block: its inputs, settings, outputs and alarm bits, and its readings in SI units."""
+"""The parts of the shell: its ports and alarms, its memory, and the checks of a call, its readings and its drives.
+
+:data:`INPUTS`, :func:`settings_of` and :data:`OUTPUTS` are what a plant sees. :func:`call_of` decides how many samples
+a call takes, :func:`sample_of` which readings are good, :class:`Drive` where a setpoint may go. :mod:`.shell` puts them
+together.
+"""
 
 import inspect
 import math
@@ -140,8 +145,10 @@ def settings_of(config: Config, puller: Puller | None = None) -> tuple[Port, ...
 
 
 def readings_of(given: Any, ranges: tuple[float, float]) -> tuple[Measured, Measured]:
-    """Readings as deviations in SI units, and whether each lies within the range of the observations; the mean pull
-    speed, which is no reading, is the pull speed."""
+    """Readings as deviations in SI units, and whether each lies within the range of the observations.
+
+    The mean pull speed, which is no reading, is the pull speed.
+    """
     seen = {each: (given[port] - given[nominal]) * unit for each, (port, nominal, _, unit) in READINGS.items()}
     ring = (given["ring_radius_mm"] - given["ring_bias_mm"] - given["r_ref_mm"]) * MM
     read = Measured(ring_error=ring, valid=np.where(given["valid"] > 0.5, 1.0, 0.0), v_p_mean=seen["v_p"], **seen)
@@ -164,8 +171,6 @@ def in_shares(setpoints: Mapping[str, Any], config: Config) -> Floats:
     power = setpoints[heater.name] * KILO - puller.Q_H_0
     return np.stack([setpoints[pull.name] * MM_PER_MIN / puller.v_0 - 1.0, power / config.heater_range], axis=-1)
 
-
-# A sample of a block: what the time of a call means, which readings are good, what the drives do.
 
 PYROMETER_JUMP, JUMP_GROWTH = 8.0, 0.02 / MINUTE
 """Largest difference of the pyrometer from what is expected [K], and its growth without a good reading [K/s]."""

@@ -1,4 +1,8 @@
-"""A recorded program as the files of a block: C99, or IEC 61131-3 structured text."""
+"""A recorded program as the files of a block: C99, or IEC 61131-3 structured text.
+
+:class:`CompiledBlock` runs the C on this machine, :func:`test_vector` records calls for a port, and :func:`shadow`
+compares a block with the drives of a plant's log.
+"""
 
 import ctypes
 import re
@@ -6,6 +10,7 @@ import shutil
 import subprocess
 import unicodedata
 from collections.abc import Iterable, Mapping
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from textwrap import indent, wrap
@@ -44,7 +49,7 @@ def fill_template(name: str, parts: Mapping[str, str]) -> str:
 
 
 def _parts(program: Program, writer: StatementWriter) -> dict[str, str]:
-    """What the templates of a block's files are filled with."""
+    """The texts for the ``$part``s of a block's templates."""
     own, wide = writer.dialects
 
     def declared(what: str, ports: Iterable[Port], kind: str) -> Iterable[str]:
@@ -72,7 +77,7 @@ def _parts(program: Program, writer: StatementWriter) -> dict[str, str]:
         "name": [f"cz_{program.name}"],
         "NAME": [f"cz_{program.name}".upper()],
         "real": [own("type of real")],
-        "about": (line for note in notes for line in wrap(safe_in_comment(note), 100)),
+        "about": chain.from_iterable(wrap(safe_in_comment(note), 100) for note in notes),
         "bits": (own("bit", bit.name, bit.value, meaning) for bit, meaning in meanings(Alarm).items()),
         "inputs": declared("input", program.inputs, "reading"),
         "settings": declared("setting", program.settings, "reading"),
@@ -96,8 +101,6 @@ def safe_in_comment(text: str) -> str:
     plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
     return re.sub(r"[*\\?{}$]+", "", plain)
 
-
-# A block's C as a library of this machine: compiled with the system's compiler, called through ctypes.
 
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
 """Options of the compiler."""
@@ -158,8 +161,6 @@ class CompiledBlock:
         return {name: setpoints[name].astype(np.float64) for name in setpoints.dtype.names or ()}, memory
 
 
-# A block beside readings that are given: a recorded test vector for a port, and a plant's log for a comparison.
-
 SAMPLES = 240
 """Calls of a test vector."""
 HEAD = ",".join(port.name for port in (*INPUTS, *OUTPUTS))
@@ -191,7 +192,7 @@ def test_vector(block: Block) -> str:
 
 
 def setpoints_on_log(block: Block, log: Any) -> tuple[Floats, Floats]:
-    """Setpoints [mm/min, kW] that a block gives on a log, each from the drives of its row, and its alarms; per row."""
+    """Setpoints on a log, each from the drives of its row, shape (rows, 2) [mm/min, kW]; alarms, shape (rows,)."""
     memory, rows = block.start(1), []
     radius, T_1 = (block.ports[name].default for name in ("nominal_radius_mm", "nominal_T_1_K"))
     r_ref = np.where(np.isfinite(log.r_ref), log.r_ref / MM, radius)

@@ -1,4 +1,4 @@
-"""Record what NumPy code computes as a straight line of operations.
+"""Record NumPy code as a straight line of operations, the :class:`Program` from which every language is written.
 
 A controller's own functions are called with :class:`Traced` arrays in place of numbers. Each arithmetic operation adds
 a :class:`Node` to a :class:`Graph`; slices, transposes and concatenations add none, because a traced array is an
@@ -153,7 +153,7 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
 
     @property
     def logical(self) -> bool:
-        """Whether its elements are logical."""
+        """Whether the elements are logical."""
         return bool(self.size) and self.graph.owner(int(self.ids.flat[0])).logical
 
     def __len__(self) -> int:
@@ -327,21 +327,18 @@ class Complex(np.lib.mixins.NDArrayOperatorsMixin):
 
 
 def complex_ufunc(name: str, *inputs: Any) -> Complex:
-    """The ufunc of complex numbers, traced in real ones."""
+    """The ufunc of complex numbers, traced in real ones; CzError for one that has no rule.
+
+    Of quotients, roots and logarithms only those of complex steps have one, whose unit is tiny.
+    """
     parts = [_parts(value) for value in inputs]
     unit = min(part.unit for part in parts if part.im is not None)
     a, b = parts[0], parts[-1]
     if name in ("add", "subtract"):
-        plus: Any = getattr(np, name)
-        im = a.im if b.im is None else (plus(0.0, b.im) if a.im is None else plus(a.im, b.im))
-        return Complex(plus(a.re, b.re), im, unit)
+        return _sum(getattr(np, name), a, b, unit)
     if name == "multiply":
-        re = a.re * b.re
-        if a.im is not None and b.im is not None and unit == 1.0:
-            re = re - a.im * b.im
-        im = sum(x * y for x, y in ((a.re, b.im), (a.im, b.re)) if x is not None and y is not None)
-        return Complex(re, im, unit)
-    if name == "divide" and (b.im is None or unit < _TINY):
+        return _product(a, b, unit)
+    if name == "divide" and (unit < _TINY or b.im is None):
         re = a.re / b.re
         top = 0.0 if a.im is None else a.im
         return Complex(re, (top if b.im is None else top - re * b.im) / b.re, unit)
@@ -351,6 +348,21 @@ def complex_ufunc(name: str, *inputs: Any) -> Complex:
     if name == "log" and unit < _TINY:
         return Complex(np.log(a.re), a.im / a.re, unit)
     raise CzError(f"cannot record np.{name} of complex numbers")
+
+
+def _sum(plus: Any, a: Complex, b: Complex, unit: float) -> Complex:
+    """The sum or difference; the imaginary part of a real term is None."""
+    im = a.im if b.im is None else (plus(0.0, b.im) if a.im is None else plus(a.im, b.im))
+    return Complex(plus(a.re, b.re), im, unit)
+
+
+def _product(a: Complex, b: Complex, unit: float) -> Complex:
+    """The product; terms of a real factor's imaginary part, None, are left out."""
+    re = a.re * b.re
+    if a.im is not None and b.im is not None and unit == 1.0:
+        re = re - a.im * b.im
+    im = sum(x * y for x, y in ((a.re, b.im), (a.im, b.re)) if x is not None and y is not None)
+    return Complex(re, im, unit)
 
 
 def _parts(value: Any) -> Complex:
@@ -363,8 +375,6 @@ def _parts(value: Any) -> Complex:
     unit = unit if 0.0 < unit < _TINY else 1.0
     return Complex(array.real, array.imag / unit, unit)
 
-
-# A recorded controller: its inputs, memory and outputs; the description from which every language is written.
 
 WIDE = ("clock_s", "called_s")
 """Memory that needs double precision also where the controller computes in single precision, beside sums over time."""
@@ -386,20 +396,20 @@ class Port(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """One array that a program remembers from sample to sample."""
+    """One array of a program's memory."""
 
     name: str
     start: Floats
     """Values before the first sample, flat."""
     after: Ids
-    """Elements that it holds after a sample."""
+    """Elements that the array holds after a sample."""
     wide: bool = False
-    """Whether it needs double precision."""
+    """Whether the array needs double precision."""
 
 
 @dataclass(frozen=True)
 class Program:
-    """What a controller computes at a sample."""
+    """The recorded operations of a controller's sample, with its ports and memory."""
 
     name: str
     graph: Graph
@@ -459,14 +469,14 @@ def record(
 
 
 def _sources(graph: Graph, node: Node) -> set[int]:
-    """The nodes whose values this one adds, limits, selects, or scales by a constant."""
+    """Numbers of the nodes whose values this node adds, limits, selects, or scales by a constant."""
     traced = [set(graph.owners(ids).tolist()) for ids in node.args if graph.values(ids) is None]
     linear = node.op in CARRY and (len(traced) == 1 or node.op not in ("multiply", "divide"))
     return set[int]().union(*traced) if linear else set()
 
 
 def _widen(graph: Graph, sources: list[set[int]], before: Ids, after: Ids) -> bool:
-    """Mark the operations that sum memory over time, as integrals and leaky means do; whether there are any.
+    """Mark the operations that sum memory over time, as integrals and leaky means do; True if there are any.
 
     Rounding errors add up in such a sum: code in single precision has it in double.
     """

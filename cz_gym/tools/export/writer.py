@@ -94,7 +94,7 @@ class Dialect:
         self._names = {"block": block, "BLOCK": block.upper(), "real": real, "f": "f" if single else ""}
 
     def __call__(self, what: str, *parts: Any, **named: Any) -> str:
-        """What SYNTAX calls so, with its parts."""
+        """The text of an entry of :data:`SYNTAX`, filled with its parts."""
         return self._syntax[what].format(*parts, **self._names, **named)
 
     def number(self, value: float) -> str:

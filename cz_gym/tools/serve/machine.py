@@ -1,4 +1,9 @@
-"""What a virtual puller leaves on the disk, whole however its process ends: the log, and the state it goes on from."""
+"""The virtual puller: one crystal behind tags, its setpoints, its clock, and its files.
+
+:class:`Machine` advances the crystal by a control interval and shows it as :data:`TAGS`; :class:`Clock` steps it in
+real time; :class:`CrystalMachine` is that of a whole crystal. :class:`LogFile` and :class:`StateFile` are whole
+however the process ends.
+"""
 
 import io
 import json
@@ -97,7 +102,7 @@ class LogFile:
 
 
 class State(NamedTuple):
-    """A crystal and what its machine knows of it."""
+    """A saved crystal with the numbers and attributes of its machine."""
 
     env: EnvState
     memory: npt.NDArray[np.float64]
@@ -141,8 +146,6 @@ class StateFile:
             np.savez(file, facts=np.array(json.dumps(facts)), memory=state.memory, **arrays)
         os.replace(new, self.path)
 
-
-# The puller behind the tags: one crystal, its setpoints, and what happens when nobody renews them.
 
 SIZE = (640, 480)
 """Width and height of the picture [px]."""
@@ -212,12 +215,8 @@ class Machine:
         self, config: Config, seed: int, watchdog: float, log: LogFile | None = None, state: StateFile | None = None
     ) -> None:
         self.env = CzEnv.from_config(config, "rgb_array", SIZE)
-        self.config, self.interval, self.watchdog, self._ranges = (
-            config,
-            config.control_interval,
-            watchdog,
-            config.ranges,
-        )
+        self.config, self.watchdog = config, watchdog
+        self.interval, self._ranges = config.control_interval, config.ranges
         self._units = np.divide(self._ranges, (MM_PER_MIN, KILO))
         saved = state.load() if state else None
         self._observation, _ = self.env.reset(seed=seed, options=saved and {"state": saved.env})
@@ -289,7 +288,7 @@ class Machine:
         return np.concatenate([np.ravel(each) for each in leaves(self._memory).values()])
 
     def write_setpoints(self, writes: dict[str, Any]) -> dict[str, str]:
-        """Take a client's values, all or none; returns the reasons of those that are refused.
+        """Take a client's values, all or none, and return the reasons of those that are refused.
 
         Setpoints are stored. They act once the client writes the number of the step that they answer to ``watchdog``.
         """
@@ -324,8 +323,8 @@ class Machine:
             return "the operator has control"
         if name in SETPOINT_NAMES:
             low, high = self.limits[name]
-            room = TOLERANCE * high
-            return "" if low - room <= value <= high + room else f"outside {low:.6g} to {high:.6g}"
+            rounding = TOLERANCE * high
+            return "" if low - rounding <= value <= high + rounding else f"outside {low:.6g} to {high:.6g}"
         return "" if self.answered < value <= self.k else f"step {self.k} is the newest, {self.answered} was answered"
 
     def _act(self) -> None:
@@ -334,7 +333,7 @@ class Machine:
 
     @property
     def control(self) -> str:
-        """Who sets the drives in the step that begins now."""
+        """The source of the drives in the step that begins now: manual, client, held or fallback."""
         if self.manual:
             return "manual"
         if self._renewed == self.k:
@@ -347,7 +346,7 @@ class Machine:
         return self._record.ending is not None
 
     def step(self) -> dict[str, Any]:
-        """Advance by one control interval with the newest setpoints; returns the tags."""
+        """Advance by one control interval with the newest setpoints, and return the tags."""
         with self._lock:
             control, before = self.control, self.hour[-1]
             if control == "fallback":
@@ -447,13 +446,11 @@ class Clock(threading.Thread):
                 self.machine.committed.wait(0.2)
 
 
-# The puller behind the tags of a whole crystal, along the recipe of its file.
-
 LATER = {
     "_1min": "_5mm", "_5min": "_25mm", "in 1 minute": "5 mm later", "in 5 minutes": "25 mm later",
     " now": " at this length", "at nominal": "at this length",
 }  # fmt: skip
-"""Words in the tags of ``Cz-v0``, where references run with time, and those of a crystal."""
+"""Words in the tags of ``Cz-v0``, where references run with time, and their words for a whole crystal."""
 
 
 def by_length(text: str) -> str:
@@ -487,8 +484,8 @@ class CrystalMachine(Machine):
     def _settings(self) -> dict[str, Any]:
         """Those of ``Cz-v0``, with the least and the largest drives that the recipe and their ranges allow."""
         drives = self._record.table[:, [_v_p, _Q_H]] / (MM_PER_MIN, KILO)
-        room = np.minimum(self._units, (self.config.puller.pull_room / MM_PER_MIN, np.inf))
-        limits = np.maximum(drives.min(axis=0) - room, 0.0), drives.max(axis=0) + room
+        reach = np.minimum(self._units, (self.config.puller.pull_room / MM_PER_MIN, np.inf))
+        limits = np.maximum(drives.min(axis=0) - reach, 0.0), drives.max(axis=0) + reach
         names = [name.replace("setpoint", end) for end in ("min", "max") for name in SETPOINT_NAMES]
         return super()._settings() | dict(zip(names, np.ravel(limits).tolist(), strict=True))
 
