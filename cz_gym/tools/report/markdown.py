@@ -1,13 +1,12 @@
 """The report for a puller, which a grower reads: diameters, scrap, v/G, margins of the loops, and a recommendation."""
 
-import pkgutil
 import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
+from cz_gym.baselines.analysis import linear_form, loop_margins
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.evaluation.plots import chosen
 from cz_gym.evaluation.protocol import Case, contract_hash
@@ -39,9 +38,6 @@ from .tables import (
 )
 from .tables import markdown as table
 
-FORM = "cz_gym.baselines.analysis:linear_form"
-LOOP = "cz_gym.baselines.analysis:loop_margins"
-"""Functions on the loops of controllers, looked up by name because this package imports no controller."""
 DIAMETER = 0.5
 """Millimetre of diameter, in millimetres of radius."""
 FIT = 0.01
@@ -146,11 +142,11 @@ def _margins(sample: Sample, result: Result) -> tuple[str, ...]:
     if sample.contender.learned:
         return absent
     try:
-        form: Any = pkgutil.resolve_name(FORM)(sample.contender.make(config), config.sole_scenario.sensor)
+        form = linear_form(sample.contender.make(config), config.sole_scenario.sensor)
     except (CzError, AttributeError):  # it has no linear form, or is no feedback
         return absent
     pullers = [make_puller(config.parameters, mix, config.meniscus) for mix in (1.0, 0.0)]
-    loops = [pkgutil.resolve_name(LOOP)(form.controller, puller, form.dt) for puller in pullers]
+    loops = [loop_margins(form.controller, puller, form.dt) for puller in pullers]
     if any(np.isnan(loop.sensitivity) for loop in loops):
         return ("unstable", *absent[1:])
     worst = (np.nanmin, "gain_up"), (np.nanmax, "gain_down"), (np.nanmin, "phase_deg"), (np.nanmin, "delay")
