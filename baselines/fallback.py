@@ -22,11 +22,12 @@ from cz_gym.support.errors import CzError
 from cz_gym.support.units import MM, MM_PER_MIN
 
 from .analysis import close, linear_form
+from .lqg_filter import MEAN_RIPPLE
 from .pid import FilteredPID, SeriesPID
 from .policy import Floats
+from .scaling import PROPORTIONAL, factors, scale_pid
 from .tuned import with_values
-from .tuned_lqg import MEAN_RIPPLE
-from .tuned_pid import CONVENTIONAL, PROPORTIONAL, factors, scaled
+from .tuned_controllers import CONVENTIONAL
 
 GAIN_MARGIN, PHASE_MARGIN = 2.5, 45.0
 """Least margins of the loop opened at the camera [-, degrees]; the gain may fall by as much as it may grow."""
@@ -72,7 +73,7 @@ class _Plant(NamedTuple):
     noise: float
     """Standard deviation of a ring reading [m]."""
     scale: dict[str, float]
-    """:func:`cz_gym.baselines.tuned_pid.factors`."""
+    """:func:`cz_gym.baselines.scaling.factors`."""
 
 
 def fallback(config: Config) -> Fallback:
@@ -90,7 +91,7 @@ def fallback(config: Config) -> Fallback:
 @lru_cache(maxsize=16)
 def _searched(config: Config, latency: float, window: float, noise: float) -> Fallback:
     plant, random = _plant(config, latency, window, noise), np.random.default_rng(0)
-    start, names = scaled(CONVENTIONAL.settings(RANDOMIZED), config), list(MIDDLE)
+    start, names = scale_pid(CONVENTIONAL.settings(RANDOMIZED), config), list(MIDDLE)
     middle, best, chosen = np.array(list(MIDDLE.values())), math.inf, None
     for trial in range(CANDIDATES):
         values = middle * np.exp(

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from scipy.linalg import solve_discrete_are
 
 from cz_gym.body.signals import PREVIEWS, WEIGHTS, Measured, Weights, coefficients
+from cz_gym.config import Config
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.support.names import stack
@@ -134,6 +135,10 @@ class LQGDesign:
     """Largest move of the pull speed that the radius error alone asks for [m/s]; None: any. What is left of the drive's
     window damps the meniscus height, without which narrow and slow drives swing between their limits until the crystal
     is lost (nested saturation, Teel 1992)."""
+
+    def for_config(self, config: Config) -> "LQG":
+        """The LQG of this design for the control interval and the puller of an environment."""
+        return LQG(design=self).for_config(config)
 
 
 MISMATCH = 1.0

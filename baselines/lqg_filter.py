@@ -11,6 +11,7 @@ from scipy.linalg import expm
 from scipy.signal import cont2discrete
 
 from cz_gym.body.process import INPUTS, OUTPUTS, linearise
+from cz_gym.episodes.scenario import Sensor
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.plant import Puller, hidden_load
 from cz_gym.support.units import MINUTE, MM
@@ -232,6 +233,17 @@ class RingModel:
     def states(self, dt: float) -> int:
         """Number of states of plant, ripple and past rings."""
         return self.first_past + self.delay(dt)[0]
+
+
+MEAN_RIPPLE = 0.4
+"""Standard deviation of a ripple whose amplitude is uniform from zero to A, in units of A: 1/sqrt(6), rounded."""
+
+
+def ring_of(sensor: Sensor) -> RingModel | None:
+    """The model of a scenario's camera; None for one without latency and ripple."""
+    if sensor.latency == 0.0 and not any(sensor.ripple):
+        return None
+    return RingModel(sensor.latency, MEAN_RIPPLE * sensor.ripple[1], rotation=sensor.rotation)
 
 
 def augmented(model: PlantModel, ring: RingModel, dt: float) -> PlantModel:

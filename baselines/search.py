@@ -7,7 +7,7 @@ stopped again, measures none of them again, and continues.
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,16 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym.config import Config
-from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
-from cz_gym.evaluation.rollout import rollout
 from cz_gym.puller.file import DEFAULT
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import check_writable, name_file_in_errors, write_files
 
-from .lqg import STEP_TIME
 from .policy import Floats
-from .tuned import Figures, Goal, value_at, with_values
+from .tuned import Measure, Objective, value_at, with_values
 
 FIRST_STEP = 0.5
 """COBYLA's first step, in natural logarithms of the parameters."""
@@ -47,23 +44,6 @@ class Trial(NamedTuple):
     """Figures behind the score."""
 
 
-Measure = Callable[[Any, Config, Sequence[int]], Any]
-
-
-def measure(policy: Any, config: Config, seeds: Sequence[int]) -> Figures:
-    """Run a controller on those episodes; figures have six digits, as in the history."""
-    means, per_step = metrics(rollout(policy, config, seeds)), STEP_TIME / config.control_interval
-    values = (
-        means.rmse_observable_mm.mean(),
-        per_step * means.pull_step_rms_mm_per_min.mean(),
-        per_step * means.heater_step_rms_kw.mean(),
-        1.0 - means.mean_pull_within_3pct.mean(),
-        means.return_.mean(),
-        means.failure_rate.mean(),
-    )
-    return Figures._make([*(float(f"{value:.6g}") for value in values), config.steps])
-
-
 class _Spent(Exception):
     """Ends COBYLA when all candidates are tried: by itself it tries at least its number of variables plus two."""
 
@@ -74,59 +54,61 @@ class Search:
     def __init__(
         self,
         controller: str,
-        goal: Goal,
+        objective: Objective,
         config: Config,
         trials: int,
         episodes: int,
-        measure: Measure = measure,
         quick: bool = False,
+        measure: Measure | None = None,
     ) -> None:
         """At most ``trials`` candidates, each on ``episodes`` training episodes; a ``quick`` search ends at QUICK_STEP,
         and only its finalists have to survive other scenarios.
         """
-        self.controller, self.goal, self.config, self.measure, self.quick = controller, goal, config, measure, quick
+        self.controller, self.objective, self.config, self.quick = controller, objective, config, quick
+        self.measure = measure or objective.measure
         self.budget, self.trials = {"trials": trials, "episodes": episodes}, list[Trial]()
         self.path: Path | None = None
         """File of the trials; None for none."""
-        self._paths = [parameter.path for parameter in goal.parameters]
+        self._paths = [parameter.path for parameter in objective.parameters]
 
     @property
     def first(self) -> tuple[float, ...]:
-        """The values with which the search begins: those of the goal's start, within their ranges."""
-        return tuple(p.value(p.coordinate(value_at(self.goal.start, p.path))) for p in self.goal.parameters)
+        """The values with which the search begins: those of the objective's start, within their ranges."""
+        return tuple(p.value(p.coordinate(value_at(self.objective.start, p.path))) for p in self.objective.parameters)
 
     def settings(self, values: Iterable[float]) -> Any:
         """The settings with these values of the parameters."""
-        return with_values(self.goal.start, dict(zip(self._paths, values, strict=True)))
+        return with_values(self.objective.start, dict(zip(self._paths, values, strict=True)))
 
     def explore(self) -> None:
         """Minimise the objective with COBYLA while every limit is kept."""
         from scipy.optimize import NonlinearConstraint, minimize
 
-        goal = self.goal
+        aim = self.objective
 
         def tried(point: Floats) -> tuple[tuple[float, ...], Any]:
-            values = tuple(p.value(x) for p, x in zip(goal.parameters, point, strict=True))
+            values = tuple(p.value(x) for p, x in zip(aim.parameters, point, strict=True))
             trial = {trial.values: trial for trial in self.trials}.get(values)
             if trial is None and len(self.trials) >= self.budget["trials"]:
                 raise _Spent
-            return values, goal.kind(**(trial or self.add(values)).facts["figures"])
+            return values, aim.kind(**(trial or self.add(values)).facts["figures"])
 
-        def objective(point: Floats) -> float:
-            return goal.objective(tried(point)[1])
+        def cost(point: Floats) -> float:
+            values, scores = tried(point)
+            return aim.cost(scores, self.settings(values).for_config(self.config))
 
         def distances(point: Floats) -> tuple[float, ...]:
-            values, figures = tried(point)
-            policy = goal.policy(self.settings(values), self.config)
-            return tuple(limit(figures, policy) for limit in goal.limits)
+            values, scores = tried(point)
+            policy = self.settings(values).for_config(self.config)
+            return tuple(limit(scores, policy) for limit in aim.limits)
 
-        start = np.array([p.coordinate(value) for p, value in zip(goal.parameters, self.first, strict=True)])
-        limits: Any = [NonlinearConstraint(distances, 0.0, np.inf)] if goal.limits else []
+        start = np.array([p.coordinate(value) for p, value in zip(aim.parameters, self.first, strict=True)])
+        limits: Any = [NonlinearConstraint(distances, 0.0, np.inf)] if aim.limits else []
         last_step = QUICK_STEP if self.quick else 1e-3
         most = max(self.budget["trials"], len(start) + 2)
         options: Any = {"maxiter": most, "rhobeg": FIRST_STEP, "tol": last_step}
         with suppress(_Spent):
-            minimize(objective, start, method="COBYLA", constraints=limits, options=options)
+            minimize(cost, start, method="COBYLA", constraints=limits, options=options)
 
     def add(self, values: tuple[float, ...]) -> Trial:
         """Score a candidate on training episodes; one that would be the best must also survive other scenarios."""
@@ -140,17 +122,16 @@ class Search:
     def _scored(self, values: tuple[float, ...], seeds: Sequence[int], survive: int, below: float = math.inf) -> Trial:
         """The candidate's trial on those seeds; survival counts if its score is ``below`` a limit."""
         settings = self.settings(values)
-        policy = self.goal.policy(settings, self.config)
-        figures = self.measure(policy, self.config, seeds)
-        score = self.goal.cost(figures, policy)
+        policy = settings.for_config(self.config)
+        scores = self.measure(policy, self.config, seeds)
+        score = self.objective.score(scores, policy)
         lost: dict[str, float] = {}
         if survive and score < below:
-            for name in self.goal.survive:
+            for name in self.objective.survive:
                 config = self.config.with_scenario(name)
-                other = self.goal.policy(settings, config)
-                lost[name] = self.measure(other, config, SURVIVAL_SEEDS[:survive]).failure_rate
-        facts = {"figures": figures._asdict(), "lost": lost}
-        return Trial(values, score + self.goal.failure_price * sum(lost.values()), facts)
+                lost[name] = self.measure(settings.for_config(config), config, SURVIVAL_SEEDS[:survive]).failure_rate
+        facts = {"figures": scores._asdict(), "lost": lost}
+        return Trial(values, score + self.objective.failure_price * sum(lost.values()), facts)
 
     def best(self, count: int) -> list[Trial]:
         """The best candidates, best first."""

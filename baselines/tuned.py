@@ -1,28 +1,32 @@
-"""Values that searches have chosen for controllers, by scenario for the default puller, or for another puller.
+"""Tuned controllers: a record each, and the values that searches have chosen, by scenario or for a puller.
 
-Those of the default puller are in ``cz_gym/puller/shipped/default``, a file a controller and scenario; those of
+Values for the default puller are in ``cz_gym/puller/shipped/default``, a file a controller and scenario; those for
 another puller are in the folder beside its file. Each file has the history of its search (``cz-gym tune``).
 """
 
 import json
 import math
 import warnings
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
-from cz_gym.config import Config
-from cz_gym.episodes.scenario import Distribution, Scenario, make_mixture
-from cz_gym.episodes.scenarios import HARD, HOT_ZONE, PULLER, RANDOMIZED, SENSOR_FAULT
+from cz_gym.body.process import BODY
+from cz_gym.config import Config, make_config
+from cz_gym.episodes.scenario import Scenario
+from cz_gym.episodes.scenarios import HARD, PULLER, RANDOMIZED, SENSOR_FAULT, find_scenario
+from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import Contender
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.process import Process
 from cz_gym.puller.file import DEFAULT, FOLDER, PullerFile
 from cz_gym.support.errors import CzError
 
-from .lqg import LQG, LQGDesign
+from .lqg import STEP_TIME, LQGDesign
+from .lqg_filter import ring_of
 
 TUNED = (RANDOMIZED, HARD, SENSOR_FAULT, PULLER)
 """Scenarios that controllers are tuned on, the least demanding first."""
@@ -105,29 +109,27 @@ def with_values(settings: Any, values: Mapping[str, float]) -> Any:
 
 def beyond(scenario: Scenario, tuned: Scenario, fields: Mapping[str, tuple[str, ...]] = MUST_COVER) -> list[str]:
     """The fields in which a scenario asks for more than a tuned one."""
-    names = [(family, name) for family, several in fields.items() for name in several]
-    return [f"{family}.{name}" for family, name in names if _exceeds(getattr(scenario, family), tuned, family, name)]
+    found = []
+    for family, name in ((family, name) for family, several in fields.items() for name in several):
+        asked, known = (getattr(each, family) for each in (scenario, tuned))
+        sign = -1.0 if getattr(type(known)(), name) == math.inf else 1.0  # a lower limit is the harder one
+        most, covered = (
+            max(map(abs, value)) if isinstance(value, tuple) else abs(value)
+            for value in (getattr(asked, name), getattr(known, name))
+        )
+        if sign * most > sign * covered:
+            found.append(f"{family}.{name}")
+    return found
 
 
-def _exceeds(asked: Any, tuned: Scenario, family: str, name: str) -> bool:
-    known = getattr(tuned, family)
-    sign = -1.0 if getattr(type(known)(), name) == math.inf else 1.0  # a lower limit is the harder one
-    return sign * _largest(getattr(asked, name)) > sign * _largest(getattr(known, name))
-
-
-def _largest(value: Any) -> float:
-    """The largest absolute value of a number or a range."""
-    return float(max(map(abs, value)) if isinstance(value, tuple) else abs(value))
-
-
-# The record of a tuned controller, and the aim of its searches.
+# The record of a tuned controller, and the objective of its searches.
 
 DIGITS = 4
 """Number of significant digits of a candidate's values."""
 LINEAR = 5.0
 """Length of a range that is not searched logarithmically, in natural logarithms of the others."""
 NEAR = 8.0
-"""How far, as a factor, a search for a puller goes from the scaled settings [-]."""
+"""Factor that a search for a puller may go from the scaled settings [-]."""
 
 
 class Parameter(NamedTuple):
@@ -161,8 +163,8 @@ def value_at(settings: Any, path: str) -> float:
     return float(attrgetter(path)(settings))
 
 
-class Figures(NamedTuple):
-    """Mean figures over episodes."""
+class Scores(NamedTuple):
+    """Means over episodes that a candidate is judged by."""
 
     rmse_mm: float
     """Observable radius error [mm]."""
@@ -177,77 +179,155 @@ class Figures(NamedTuple):
     steps: int
     """Number of steps of an episode."""
 
+    def __str__(self) -> str:
+        lost = f"{100 * self.failure_rate:.0f} % lost"
+        return f"RMSE {self.rmse_mm:.3f} mm, {lost} on validation crystals, half of them with other hot zones"
 
-Limit = Callable[[Figures, Any], float]
-"""Distance of a candidate to a limit, by its figures and controller; negative beyond it."""
+
+def measure(policy: Any, config: Config, seeds: Sequence[int]) -> Scores:
+    """Run a controller on those episodes; scores have six digits, as in the history."""
+    means, per_step = metrics(rollout(policy, config, seeds)), STEP_TIME / config.control_interval
+    values = (
+        means.rmse_observable_mm.mean(),
+        per_step * means.pull_step_rms_mm_per_min.mean(),
+        per_step * means.heater_step_rms_kw.mean(),
+        1.0 - means.mean_pull_within_3pct.mean(),
+        means.return_.mean(),
+        means.failure_rate.mean(),
+    )
+    return Scores._make([*(float(f"{value:.6g}") for value in values), config.steps])
+
+
+Measure = Callable[[Any, Config, Sequence[int]], Any]
+"""Scores of a controller in an environment on the crystals of those seeds."""
+Limit = Callable[[Any, Any], float]
+"""Distance of a candidate to a limit, by its scores and controller; negative beyond it."""
 
 
 @dataclass(frozen=True)
-class Goal:
-    """The aim of a search: the least objective within limits."""
+class Objective:
+    """The least cost within limits: the aim of a search."""
 
-    start: Any
-    """Settings with which the search begins; numbers that are no parameters keep their value."""
-    parameters: tuple[Parameter, ...]
-    survive: tuple[str, ...]
-    """Scenarios that only have to be survived."""
-    objective: Callable[[Any], float]
-    """Score within the limits, failures included; a search minimises it."""
+    cost: Callable[[Any, Any], float]
+    """Cost of a candidate within the limits, failures included, by its scores and controller; a search minimises it."""
     limits: tuple[Limit, ...]
     failure_price: float
     """Cost of losing every crystal."""
     miss_price: float
     """Price of a negative distance."""
-    kind: type[Any] = Figures
-    """Type of the figures that candidates are judged by."""
+    survive: tuple[str, ...] = ()
+    """Scenarios that only have to be survived."""
+    kind: type[Any] = Scores
+    """Type of the scores that candidates are judged by."""
+    measure: Measure = measure
+    """Finds the scores of a candidate."""
+    start: Any = None
+    """Settings with which the search begins; numbers that are no parameters keep their value."""
+    parameters: tuple[Parameter, ...] = ()
 
-    def policy(self, settings: Any, config: Config) -> Any:
-        """The controller with these settings, which are an LQG's design or a controller, for an environment."""
-        return (LQG(design=settings) if isinstance(settings, LQGDesign) else settings).for_config(config)
+    def score(self, scores: Any, policy: Any) -> float:
+        """The cost plus the price of missed limits."""
+        missed = sum(max(0.0, -limit(scores, policy)) for limit in self.limits)
+        return self.cost(scores, policy) + self.miss_price * missed
 
-    def cost(self, figures: Any, policy: Any) -> float:
-        """The objective plus the price of missed limits: the score of the figures on the scenario itself."""
-        missed = sum(max(0.0, -limit(figures, policy)) for limit in self.limits)
-        return self.objective(figures) + self.miss_price * missed
+
+ANY, OWN_PULLER = "any", "own puller"
+"""Keys of a controller's objectives: of every other scenario, and of a puller of the user's own."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tuned(ABC):
-    """A tuned controller: the only record of its name, its settings everywhere, and the searches that choose them."""
+class TunedController:
+    """A tuned controller: the only record of its name, its settings everywhere, and the searches that choose them.
 
-    per_parameter: ClassVar[int]
-    """Largest number of candidates of a search for a puller, for each parameter."""
+    Its settings are its ``start`` with the values that a search has chosen; ``for_config`` of them makes the controller
+    for an environment.
+    """
 
     name: str
     meaning: str
     """Description in one line, for tables."""
+    start: Any
+    """Settings before any search: a controller, or the design of an LQG."""
+    parameters: tuple[Parameter, ...]
+    """Numbers that a search varies."""
+    robust: tuple[Parameter, ...] = ()
+    """Numbers that it varies too on scenarios that are more demanding than ``randomized``."""
+    near: tuple[Parameter, ...] = ()
+    """Numbers that ``cz-gym tune --puller`` varies around the scaled settings; none: it leaves the controller out."""
+    objectives: Mapping[str, Objective] = field(hash=False)
+    """Objectives of its searches, by scenario, with the keys ``ANY`` and ``OWN_PULLER`` too."""
+    scale: Callable[[Any, Config], Any] | None
+    """Puts settings in proportion to the puller of an environment; None keeps them."""
+    crystals: Any = RANDOMIZED
+    """Crystals of its search on ``randomized``."""
+    crystals_on_puller: Any = field(default_factory=lambda: {"randomized": 0.5, "hot-zone": 0.5}, hash=False)
+    """Crystals of its search for a puller."""
+    stages: Mapping[str, float] | None = field(default=None, hash=False)
+    """Shares of the stages among those crystals; None for a controller of the body."""
+    begins_with: str = ""
+    """Scenario whose settings its searches begin with; by default the scenario of the search, "start" for the start."""
+    one_for_all: bool = False
+    """Whether the settings for ``randomized`` serve every scenario."""
+    filter_of: str = ""
+    """Controller whose filter, searched for a puller, it has there; empty if the search is its own."""
+    candidates: int = 6
+    """Largest number of candidates of a search for a puller, for each parameter."""
+    episodes: int = 20
+    """Training episodes of a candidate of a search for a puller."""
     default: bool = True
     """Whether a benchmark that names no controllers runs it."""
     quoted: bool = False
     """Whether it stands in short tables."""
     on_puller: bool = True
-    """Whether it has settings of its own on a puller of the user's."""
-    searched_on_puller: bool = True
-    """Whether ``cz-gym tune --puller`` searches its settings."""
-    hot_zones: bool = True
-    """Whether half of the crystals of its search on ``randomized`` are of ``hot-zone``."""
+    """Whether a benchmark on a puller of the user's own that names no controllers runs it."""
 
-    @abstractmethod
+    @property
+    def process(self) -> Process:
+        """What it controls."""
+        process: Process = getattr(self.start, "process", BODY)
+        return process
+
+    def settings(self, scenario: Scenario) -> Any:
+        """Tuned settings for a scenario on the default puller; a design has the model of the scenario's camera."""
+        start = self.start
+        if isinstance(start, LQGDesign):
+            start = replace(start, ring=ring_of((PULLER if self.one_for_all else scenario).sensor))
+        return with_values(start, for_scenario(self.name, RANDOMIZED if self.one_for_all else scenario))
+
     def make(self, config: Config) -> Any:
-        """The controller for an environment."""
+        """The controller for an environment: tuned for its scenario, or scaled to its puller and tuned for that."""
+        if self.scale is None or (config.puller == DEFAULT and self.process == BODY):
+            scenario = RANDOMIZED if self.one_for_all else config.sole_scenario
+            return self.settings(scenario).for_config(config)
+        values = for_puller(self.filter_of or self.name, config.puller)
+        own = {path: value for path, value in values.items() if not self.filter_of or path.startswith("noise.")}
+        return with_values(self.scale(self.settings(RANDOMIZED), config), own).for_config(config)
 
-    @abstractmethod
-    def goal(self, scenario: Scenario) -> Goal:
-        """The goal of its search on a scenario with the default puller; CzError if there is none."""
+    def objective(self, scenario: Scenario) -> Objective:
+        """The objective of its search on a scenario with the default puller; CzError if there is none."""
+        objective = self.objectives.get(scenario.name, self.objectives.get(ANY))
+        if objective is None:
+            known = (name for name in self.objectives if name != OWN_PULLER)
+            raise CzError(f"{self.name} has no goal on {scenario.name!r}, but on {', '.join(known)}")
+        begins = find_scenario(self.begins_with) if self.begins_with not in ("", "start") else scenario
+        start = self.start if self.begins_with == "start" else self.settings(begins)
+        more = self.robust if beyond(scenario, RANDOMIZED) else ()
+        return replace(objective, start=start, parameters=(*self.parameters, *more))
 
-    @abstractmethod
-    def goal_on(self, config: Config) -> Goal:
-        """The goal of its search for the puller of an environment."""
+    def objective_on(self, config: Config) -> Objective:
+        """The objective of its search for the puller of an environment, near the settings in proportion to it."""
+        assert self.scale is not None
+        start = self.scale(self.settings(RANDOMIZED), config)
+        near = tuple(each.near(start) for each in self.near)
+        return replace(self.objectives[OWN_PULLER], start=start, parameters=near)
 
-    def crystals(self, scenario: Scenario) -> Distribution:
-        """The crystals on which the candidates of its search on a scenario are scored."""
-        mixed = scenario == RANDOMIZED and self.hot_zones
-        return make_mixture([(HOT_ZONE, 0.5), (RANDOMIZED, 0.5)]) if mixed else scenario
+    def search_config(self, scenario: Scenario, interval: float | None = None, puller: Any = None) -> Config:
+        """The environment of its search on a scenario, or for a puller of the user's own."""
+        crystals = self.crystals if scenario == RANDOMIZED else scenario
+        return make_config(
+            crystals if puller is None else self.crystals_on_puller, None, "measured", interval,
+            action="direct", puller=puller, process=self.process, stage=self.stages,
+        )  # fmt: skip
 
     @property
     def contender(self) -> Contender:

@@ -21,7 +21,7 @@ import numpy as np
 from cz_gym.baselines.lqg import LQG, quadratic_cost, samples_ahead
 from cz_gym.baselines.lqg_filter import DRIFT, HEATER, PLANT, STATES
 from cz_gym.baselines.policy import Floats
-from cz_gym.baselines.tuned_lqg import BEST_RETURN
+from cz_gym.baselines.tuned_controllers import BEST_RETURN
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.physics.plant import Disturbance, State, hidden_load, rk4
@@ -134,4 +134,4 @@ def best_corrections(H: Floats, g: Floats, free: Floats, rows: Floats, most: Flo
 def mpc(config: Config) -> MPC:
     """Make the controller for an environment, with the design of ``lqg``."""
     scenario = config.sole_scenario
-    return MPC(design=BEST_RETURN.design(scenario), actuators=scenario.actuators).for_config(config)
+    return MPC(design=BEST_RETURN.settings(scenario), actuators=scenario.actuators).for_config(config)

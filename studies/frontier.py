@@ -1,6 +1,6 @@
 """Radius errors over the LQG's at equal pull activity: ``python -m studies.frontier benchmark.json``.
 
-The LQG's settings (:data:`cz_gym.baselines.tuned_lqg.FAMILY`) are the reference family of
+The LQG's settings (:data:`cz_gym.baselines.tuned_controllers.FAMILY`) are the reference family of
 :mod:`cz_gym.evaluation.statistics`. With ``episodes.csv`` beside it, each ratio has a 95 % bootstrap interval.
 """
 
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
-from cz_gym.baselines.tuned_lqg import FAMILY
+from cz_gym.baselines.tuned_controllers import FAMILY
 from cz_gym.evaluation.statistics import Estimate, Point, Resamples, frontier, intervals, ratios
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.errors import CzError

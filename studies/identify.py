@@ -19,8 +19,7 @@ import numpy as np
 from cz_gym import CzEnv, Parameters, make_puller
 from cz_gym.baselines.lqg import LQG
 from cz_gym.baselines.pid import FilteredPID
-from cz_gym.baselines.tuned_lqg import FILTER, LQGS
-from cz_gym.baselines.tuned_pid import PIDS
+from cz_gym.baselines.tuned_controllers import FILTER, LQGS, PIDS
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Pullers
 from cz_gym.episodes.scenarios import RANDOMIZED
@@ -112,7 +111,7 @@ def study(number: int, crystals: int) -> Row:
         identified = read_puller(Path(name) / "my.toml")
     config = make_config(SCENARIO, observation="measured", action="direct", puller=truth)
     (tuned,) = (each for each in LQGS if each.name == FILTER)
-    design = tuned.design(config.sole_scenario)
+    design = tuned.settings(config.sole_scenario)
     policies = [
         replace(LQG(design=design).for_config(config), parameters=told.parameters, puller=told, any_environment=True)
         for told in (truth, identified, start)

@@ -8,9 +8,19 @@ from cz_gym.baselines.lqg import LQG, LQGDesign
 from cz_gym.baselines.lqg_bounds import full_information, privileged
 from cz_gym.baselines.pid import CompensatedPID
 from cz_gym.baselines.policy import OpenLoop, Policy
-from cz_gym.baselines.tuned_crystal import CRYSTALS, RING_PID, TRUE_PID, in_proportion
-from cz_gym.baselines.tuned_lqg import BEST_RETURN, FILTER, LQGS, TunedLQG, adaptive
-from cz_gym.baselines.tuned_pid import PIDS, paper_here
+from cz_gym.baselines.scaling import scale_crystal
+from cz_gym.baselines.tuned import TunedController
+from cz_gym.baselines.tuned_controllers import (
+    BEST_RETURN,
+    CRYSTALS,
+    FILTER,
+    LQGS,
+    PIDS,
+    RING_PID,
+    TRUE_PID,
+    adaptive,
+    paper_here,
+)
 from cz_gym.body.process import BODY
 from cz_gym.config import Config, check_config
 from cz_gym.crystal.process import CRYSTAL
@@ -20,12 +30,12 @@ from cz_gym.support.errors import CzError
 from cz_gym.support.names import unknown_name_message
 
 
-def _changed(change: Callable[[LQG], Policy], tuned: TunedLQG, config: Config) -> Policy:
+def _changed(change: Callable[[LQG], Policy], tuned: TunedController, config: Config) -> Policy:
     return change(tuned.make(config))
 
 
 def _designed(make: Callable[[LQGDesign, Config], Policy], config: Config) -> Policy:
-    return make(BEST_RETURN.design(config.sole_scenario), config)
+    return make(BEST_RETURN.settings(config.sole_scenario), config)
 
 
 _measured = partial(Contender, observation="measured")
@@ -91,11 +101,11 @@ CONTROLLERS: tuple[Contender, ...] = (
 """Every named controller of ``Cz-v0``, in the order of tables."""
 CRYSTAL_CONTROLLERS: tuple[Contender, ...] = (
     Contender("recipe", partial(unchanged, OpenLoop()), "measured", "the recipe's pull speed and power, no feedback"),
-    Contender("ring-pid", partial(in_proportion, RING_PID), "measured", "PID on the bright ring with the body's gains"),
+    Contender("ring-pid", partial(scale_crystal, RING_PID), "measured", "PID on the bright ring with the body's gains"),
     *(each.contender for each in CRYSTALS),
     Contender(
         "true-radius",
-        partial(in_proportion, TRUE_PID),
+        partial(scale_crystal, TRUE_PID),
         "state",
         "bound: the PID on the true radius, which no sensor shows",
         privileged=True,

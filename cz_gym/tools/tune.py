@@ -9,30 +9,22 @@ import argparse
 import json
 import shlex
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
-from cz_gym.baselines import tuned_crystal
-from cz_gym.baselines.search import Measure, Search, Trial, measure
-from cz_gym.baselines.tuned import Tuned, file_name, folder_of
-from cz_gym.baselines.tuned_crystal import CRYSTALS, SCENARIOS, STAGES, TunedCrystal
-from cz_gym.baselines.tuned_lqg import LQGS
-from cz_gym.baselines.tuned_pid import PIDS
-from cz_gym.config import Config, make_config
-from cz_gym.crystal.process import CRYSTAL, ENVIRONMENTS
+from cz_gym.baselines.search import Search, Trial
+from cz_gym.baselines.tuned import OWN_PULLER, TunedController, file_name, folder_of
+from cz_gym.baselines.tuned_controllers import CRYSTALS, LQGS, PIDS
+from cz_gym.body.process import BODY
+from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.evaluation.parallel import side_by_side
 from cz_gym.puller.file import FOLDER, PullerFile, chosen_puller
-from cz_gym.support.command_line import OneLineParser, between, relative_path
+from cz_gym.support.command_line import OneLineParser, between, shown
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown_name_message
+from cz_gym.support.names import unknown
 
-_ALL: tuple[Tuned | TunedCrystal, ...] = (*PIDS, *LQGS, *CRYSTALS)
-CZ = "Cz-v0"
-TUNABLE = {each.name: each for each in _ALL}
-EPISODES = {CZ: 20, CRYSTAL.name: 60}
-"""Training episodes of a candidate for a puller, by environment: of whole crystals three in five are crowns."""
-Task = tuple[Tuned | TunedCrystal, PullerFile, int, int, Path]
+TUNABLE: dict[str, TunedController] = {each.name: each for each in (*PIDS, *LQGS, *CRYSTALS)}
+Task = tuple[TunedController, PullerFile, int, int, Path]
 """A search for a puller: controller, puller, candidates, episodes and folder."""
 
 
@@ -48,7 +40,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     about = "candidates to try, those of an earlier run included (100; with --puller at most 10 to 48)"
     add("--trials", type=between(1, 100_000), help=about)
     add("--episodes", type=between(5, 5000), help="episodes a candidate (100; with --puller 20, whole crystals 60)")
-    add("--env", choices=ENVIRONMENTS, default=CZ, help=f"with --puller: whose controllers to search (default: {CZ})")
+    add(
+        "--env",
+        choices=ENVIRONMENTS,
+        default=BODY.name,
+        help=f"with --puller: whose controllers to search (default: {BODY.name})",
+    )
     add("--out", type=Path, help="folder of histories and choices (runs/tuning; with --puller beside its file)")
     return parser.run(_tune, arguments, "benchmark", "the same command continues from the candidates in its history")
 
@@ -67,84 +64,62 @@ def _tune(given: argparse.Namespace) -> None:
     scenario = find_scenario(name)
     tuned = known.get(given.controller)
     if tuned is None:
-        raise CzError(unknown_name_message("controller to tune", given.controller, known))
-    trials, episodes, interval = given.trials or 100, given.episodes or 100, given.control_interval or 5.0
-    if isinstance(tuned, TunedCrystal):
-        if scenario != RANDOMIZED:
-            raise CzError(f"{tuned.name} has one search: leave --scenario {name} out")
-        config = make_config(SCENARIOS, None, "measured", interval, action="direct", process=CRYSTAL, stage=STAGES)
-        search = Search(tuned.name, tuned.goal, config, trials, episodes, tuned_crystal.measure)
-    else:
-        config = make_config(tuned.crystals(scenario), None, "measured", interval, action="direct")
-        search = Search(tuned.name, tuned.goal(scenario), config, trials, episodes, measure)
+        raise CzError(unknown("controller to tune", given.controller, known))
+    if tuned.process != BODY and scenario != RANDOMIZED:
+        raise CzError(f"{tuned.name} has one search: leave --scenario {name} out")
+    config = tuned.search_config(scenario, given.control_interval)
+    search = Search(tuned.name, tuned.objective(scenario), config, given.trials or 100, given.episodes or 100)
     path = (given.out or Path("runs/tuning")) / file_name(tuned.name, name)
     chosen = search.tune(path)
     print(f"{tuned.name} on {name}: score {chosen.score:.4f} on validation crystals")
-    for parameter, value in zip(search.goal.parameters, chosen.values, strict=True):
+    for parameter, value in zip(search.objective.parameters, chosen.values, strict=True):
         print(f"  {parameter.path} = {value:.6g}")
-    print(f"wrote {relative_path(path)}")
+    print(f"wrote {shown(path)}")
 
 
-def tunable(given: argparse.Namespace) -> dict[str, Tuned | TunedCrystal]:
+def tunable(given: argparse.Namespace) -> dict[str, TunedController]:
     """The controllers that may be named: with ``--env CzCrystal-v0`` those of whole crystals alone."""
-    return {name: each for name, each in TUNABLE.items() if given.env == CZ or isinstance(each, TunedCrystal)}
+    return {name: each for name, each in TUNABLE.items() if given.env in (BODY.name, each.process.name)}
 
 
 def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
     """Search for a puller, several controllers side by side, and print what was chosen."""
     from tqdm import tqdm
 
-    known = {name: each for name, each in tunable(given).items() if getattr(each, "searched_on_puller", True)}
+    known = {name: each for name, each in tunable(given).items() if each.near}
     if given.controller not in (None, *known):
-        raise CzError(unknown_name_message("controller to tune for a puller", given.controller, known))
-    alike = [each for each in known.values() if isinstance(each, TunedCrystal) == (given.env != CZ)]
+        raise CzError(unknown("controller to tune for a puller", given.controller, known))
+    alike = [each for each in known.values() if each.process.name == given.env]
     searched = [known[given.controller]] if given.controller else alike
-    crystals = isinstance(searched[0], TunedCrystal)
     beside = folder_of(puller).absolute()
     if puller.file and puller.file.resolve().parent == FOLDER.resolve():
         raise CzError(f"{puller.name} ships with what was designed for it: to search anew, copy {puller.file}")
     folder = (given.out or beside).absolute()
     tasks: list[Task] = []
     for each in searched:
-        config, _ = crystals_on(each, puller)
-        trials = given.trials or each.per_parameter * len(each.goal_on(config).parameters)
-        tasks.append((each, puller, trials, given.episodes or EPISODES[config.process.name], folder))
+        trials = given.trials or each.candidates * len(each.near)
+        tasks.append((each, puller, trials, given.episodes or each.episodes, folder))
     with tqdm(total=sum(task[2] for task in tasks), unit="candidate", dynamic_ncols=True, disable=None) as bar:
 
-        def look() -> None:
+        def poll_progress() -> None:
             bar.update(sum(tried(folder / f"{task[0].name}.json") for task in tasks) - bar.n)
 
-        for number, chosen in side_by_side(search_for, tasks, look, given.cluster, folder):
-            look()
-            figures = chosen.facts["figures"]
-            if crystals:
-                said = f"crown's largest errors {figures['crown_mm']:.2f} mm, tail's {figures['tail_mm']:.2f} mm"
-                among = "half of them hard"
-            else:
-                said, among = f"RMSE {figures['rmse_mm']:.3f} mm", "half of them with other hot zones"
-            lost = f"{100 * figures['failure_rate']:.0f} % lost"
-            bar.write(f"{tasks[number][0].name}: {said}, {lost} on validation crystals, {among}")
+        for number, chosen in side_by_side(search_for, tasks, poll_progress, given.cluster, folder):
+            poll_progress()
+            tuned = tasks[number][0]
+            bar.write(f"{tuned.name}: {tuned.objectives[OWN_PULLER].kind(**chosen.facts['figures'])}")
     command = f"cz-gym benchmark --puller {shlex.quote(str(puller.file or puller.name))}"
     moved = "" if folder == beside else f"moved to {beside}, "
-    print(f"wrote {folder}: {moved}{command}{f' --env {CRYSTAL.name}' if crystals else ''} runs what was designed")
+    env = "" if searched[0].process == BODY else f" --env {searched[0].process.name}"
+    print(f"wrote {folder}: {moved}{command}{env} runs what was designed")
 
 
 def search_for(task: Task) -> Trial:
     """One search for a puller."""
     tuned, puller, trials, episodes, folder = task
-    config, measures = crystals_on(tuned, puller)
-    search = Search(tuned.name, tuned.goal_on(config), config, trials, episodes, measures, True)
+    config = tuned.search_config(RANDOMIZED, puller=puller)
+    search = Search(tuned.name, tuned.objective_on(config), config, trials, episodes, quick=True)
     return search.tune(folder / f"{tuned.name}.json")
-
-
-def crystals_on(tuned: Tuned | TunedCrystal, puller: PullerFile) -> tuple[Config, Measure]:
-    """The crystals that a controller is designed on for a puller, half of them with other hot zones or ``hard``, and
-    what measures it there."""
-    if isinstance(tuned, TunedCrystal):
-        whole = partial(make_config, process=CRYSTAL, stage=STAGES)
-        return whole(SCENARIOS, None, "measured", action="direct", puller=puller), tuned_crystal.measure
-    mixed = {"randomized": 0.5, "hot-zone": 0.5}
-    return make_config(mixed, None, "measured", action="direct", puller=puller), measure
 
 
 def tried(path: Path) -> int:

@@ -6,7 +6,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from cz_gym.baselines.tuned_lqg import FAMILY
+from cz_gym.baselines.tuned_controllers import FAMILY
 from cz_gym.evaluation.statistics import ratios
 from cz_gym.tools.report.tables import markdown
 
