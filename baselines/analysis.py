@@ -31,7 +31,7 @@ from cz_gym.support.names import leaves, map_arrays
 
 from .lqg import LQG
 from .pid import Compensator, FilteredPID, SeriesPID
-from .policy import OpenLoop, State
+from .policy import ControllerState, OpenLoop
 
 _SMALL = 1e-6
 """Observed amplitude below every limit, gate and dead zone [-]; float32 actions keep their relative precision."""
@@ -95,7 +95,7 @@ def linear_controller(
         raise NotLinearError(f"{name} has a memory that is no named tuple of arrays, so it has no state space here")
     parts = _parts(rest)
     if free is None:
-        free = [part for part in parts if not (isinstance(rest, State) and part.startswith("readings."))]
+        free = [part for part in parts if not (isinstance(rest, ControllerState) and part.startswith("readings."))]
     memory = sum(parts[part].size for part in free)
     probes = np.eye(memory + channels) * _SMALL
     still, once, twice = (_answer(policy, factor * probes, rest, free) for factor in (0.0, 1.0, 2.0))

@@ -22,7 +22,7 @@ from cz_gym.support.errors import CzError
 from cz_gym.support.names import stack
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
 
-from .policy import Floats, batched, fresh, to_action
+from .policy import Floats, batched, reset_rows, to_action
 
 _EPS = 1e-9
 
@@ -334,7 +334,7 @@ _CHANNELS = tuple(channel.name for channel in STATE)
 _X = ("r_c_error", "h_c", "T_1", "T_2", "T_b")
 
 
-class Memory(NamedTuple):
+class ClairvoyantMemory(NamedTuple):
     """The memory of the clairvoyant."""
 
     step: Floats
@@ -379,14 +379,18 @@ class OptimalInputs:
     made_for: TargetEnv
 
     def predict(
-        self, observation: Any, state: Memory | None = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[npt.NDArray[np.float32], Memory]:
+        self,
+        observation: Any,
+        state: ClairvoyantMemory | None = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[npt.NDArray[np.float32], ClairvoyantMemory]:
         """Return the action and the next memory; arguments as of :class:`cz_gym.baselines.policy.Policy`."""
         array, single = batched(observation)
         n, best = len(array), self.best
         if n != len(self.inputs_0):
             raise CzError(f"clairvoyant has a plan for {len(self.inputs_0)} episodes, not {n}")
-        memory = fresh(state, Memory(np.zeros(n), np.zeros((n, INPUTS))), episode_start)
+        memory = reset_rows(state, ClairvoyantMemory(np.zeros(n), np.zeros((n, INPUTS))), episode_start)
         k, slot = np.minimum(memory.step.astype(int), len(best.u) - 1), np.arange(n)
         seen = array * scales(STATE, *self.ranges)
         x = seen[:, [_CHANNELS.index(name) for name in _X]] + self.state_0
@@ -394,4 +398,4 @@ class OptimalInputs:
         deviation = np.concatenate([x - best.x[k, slot], memory.correction], axis=-1)
         correction = memory.correction + (best.feedback[k, slot] @ deviation[:, :, None])[:, :, 0]
         pull, power = ((best.u[k, slot] + correction - self.inputs_0) / self.ranges).T
-        return tag(to_action(pull, power, single), self.made_for), Memory(memory.step + 1.0, correction)
+        return tag(to_action(pull, power, single), self.made_for), ClairvoyantMemory(memory.step + 1.0, correction)

@@ -19,7 +19,7 @@ from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.process import Process, scales, signals
 from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN
 
-from .pid import Heat, PIDState, SeriesPID, TemperatureLoop
+from .pid import HeaterMemory, PIDState, SeriesPID, TemperatureLoop
 from .policy import Floats, MeasuredController, check_numbers
 
 BLEND = 40.0 * MM
@@ -45,7 +45,7 @@ class CrystalPIDMemory(NamedTuple):
     pid: PIDState
     command: Floats
     """Last commanded pull speed above the recipe's [m/s]."""
-    heat: Heat
+    heat: HeaterMemory
     start: Floats
     """What the pyrometer showed above the recipe at the first sample [K]."""
 
@@ -148,7 +148,7 @@ _SEEN = np.array([MM, 1.0, 1.0])
 """Sizes of what is seen: ring [m], pyrometer [K], load cell [N]."""
 
 
-class Noise(NamedTuple):
+class CrystalNoise(NamedTuple):
     """What the filter expects."""
 
     ring: float = 0.06 * MM
@@ -177,7 +177,7 @@ class Noise(NamedTuple):
     """Correlation time of drift and recipe's error [s]."""
 
 
-class Weights(NamedTuple):
+class CrystalWeights(NamedTuple):
     """What the regulator weighs: deviations that cost 1."""
 
     radius: float = 0.5 * MM
@@ -190,7 +190,7 @@ class Weights(NamedTuple):
     power_step: float = 1.0 * KILO
 
 
-class Gains(NamedTuple):
+class CrystalGains(NamedTuple):
     """Model, filter and regulator at lengths L [m]: each of shape (lengths, rows, columns)."""
 
     L: Floats
@@ -206,7 +206,9 @@ class Gains(NamedTuple):
 
 
 @lru_cache(maxsize=12)
-def design(parameters: Any, meniscus: MeniscusModel, dt: float, lam: float, noise: Noise, weights: Weights) -> Gains:
+def design(
+    parameters: Any, meniscus: MeniscusModel, dt: float, lam: float, noise: CrystalNoise, weights: CrystalWeights
+) -> CrystalGains:
     """Design filter and regulator for a control interval [s]."""
     at = linear_recipe(parameters, meniscus, lam)
     walks = noise.height * in_cones(noise.cones, at.L, parameters)
@@ -215,10 +217,12 @@ def design(parameters: Any, meniscus: MeniscusModel, dt: float, lam: float, nois
         _at(A, B, C, at.load, dt, noise._replace(height=float(walk)), weights._replace(height=float(height)))
         for A, B, C, walk, height in zip(at.A, at.B, at.C, walks, heights, strict=True)
     ]
-    return Gains(at.L, *(np.stack(each) for each in zip(*designs, strict=True)))
+    return CrystalGains(at.L, *(np.stack(each) for each in zip(*designs, strict=True)))
 
 
-def _at(A: Floats, B: Floats, C: Floats, load: float, dt: float, noise: Noise, weights: Weights) -> tuple[Floats, ...]:
+def _at(
+    A: Floats, B: Floats, C: Floats, load: float, dt: float, noise: CrystalNoise, weights: CrystalWeights
+) -> tuple[Floats, ...]:
     """A, B and C in discrete time, K and F at one length."""
     rates = 1.0 / np.array([noise.tau, noise.slow, noise.slow])
     whole = np.zeros((STATES + DRIVES, STATES + DRIVES))
@@ -242,7 +246,7 @@ def _at(A: Floats, B: Floats, C: Floats, load: float, dt: float, noise: Noise, w
     return F_d, B_d, seen, P @ seen.T @ S, F, S
 
 
-def _regulator(A: Floats, B: Floats, weights: Weights) -> Floats:
+def _regulator(A: Floats, B: Floats, weights: CrystalWeights) -> Floats:
     """From states, without the mass, and last drives to drives: least mean cost of radius, drives and their steps."""
     n = REGULATED + DRIVES
     move, act, cost, cross = np.zeros((n, n)), np.zeros((n, DRIVES)), np.zeros((n, n)), np.zeros((n, DRIVES))
@@ -289,8 +293,8 @@ class CrystalLQG(MeasuredController):
     """Shares of conduction that it considers possible [-]."""
     forgets: float = 2.0 * HOUR
     """Time after which a model's mistakes are forgotten [s]."""
-    noise: Noise = field(default_factory=Noise)
-    weights: Weights = field(default_factory=Weights)
+    noise: CrystalNoise = field(default_factory=CrystalNoise)
+    weights: CrystalWeights = field(default_factory=CrystalWeights)
     jump: float = 1.0 * MM
     """Largest innovation of the ring that counts [m]."""
 

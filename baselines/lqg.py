@@ -146,7 +146,7 @@ MISMATCH = 1.0
 which may also stick or drift, twice as much [-]."""
 
 
-class Gains(NamedTuple):
+class LQGGains(NamedTuple):
     """Filter and regulator of one puller, or of one puller a slot."""
 
     filter: PlantFilter
@@ -154,7 +154,7 @@ class Gains(NamedTuple):
     """Its arrays have a leading axis n for one puller a slot."""
 
 
-class Memory(NamedTuple):
+class LQGMemory(NamedTuple):
     """The memory of an LQG."""
 
     filter: Any
@@ -168,24 +168,24 @@ class Memory(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def solve(design: LQGDesign, dt: float, puller: Puller, meniscus: MeniscusModel = HURLE) -> Gains:
+def solve(design: LQGDesign, dt: float, puller: Puller, meniscus: MeniscusModel = HURLE) -> LQGGains:
     """Linearise at the puller's operating point and solve the regulator's Riccati equation."""
     model = plant_model(puller, design.noise, dt, meniscus)
     if design.ring is not None:
         model = augmented(model, design.ring, dt)
     chosen = design.nonlinear, design.gate, design.ring
     state_filter = PlantFilter(puller, model, design.noise, meniscus, dt, *chosen)
-    return Gains(state_filter, regulator(model, design.weights, dt))
+    return LQGGains(state_filter, regulator(model, design.weights, dt))
 
 
 def solve_each(
     designs: Sequence[LQGDesign], dt: float, pullers: Sequence[Puller], meniscus: MeniscusModel = HURLE
-) -> Gains:
+) -> LQGGains:
     """The gains of one design and one puller a slot; the designs may differ in the noise that drives the plant."""
     pairs = zip(designs, pullers, strict=True)
     filters, laws = zip(*(solve.__wrapped__(each, dt, puller, meniscus) for each, puller in pairs), strict=True)
     plant = stack([each.plant for each in filters])
-    return Gains(filters[0]._replace(puller=stack(pullers), plant=plant), stack(laws))
+    return LQGGains(filters[0]._replace(puller=stack(pullers), plant=plant), stack(laws))
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ class LQG(MeasuredController):
         return self.hypotheses is None
 
     @cached_property
-    def gains(self) -> Gains:
+    def gains(self) -> LQGGains:
         """Gains of the design point."""
         puller = make_puller(self.parameters, self.design.lam, self.meniscus)
         return solve(self.design, self.control_interval, puller, self.meniscus)
@@ -213,13 +213,13 @@ class LQG(MeasuredController):
         """The filter, or the bank of filters, for n slots."""
         return self.gains.filter if self.hypotheses is None else _bank(self, self.hypotheses, n)
 
-    def at_rest(self, seen: Measured) -> Memory:
+    def at_rest(self, seen: Measured) -> LQGMemory:
         """The filter at its initial covariance."""
         n = len(seen.v_p)
         plan = np.zeros((n, 2, samples_ahead(self.control_interval) + 1))
-        return Memory(self.estimator(n).at_rest(n), plan, np.zeros((n, 2)), np.zeros(n))
+        return LQGMemory(self.estimator(n).at_rest(n), plan, np.zeros((n, 2)), np.zeros(n))
 
-    def step(self, seen: Measured, memory: Memory) -> tuple[Floats, Floats, Memory]:
+    def step(self, seen: Measured, memory: LQGMemory) -> tuple[Floats, Floats, LQGMemory]:
         """Pull speed and heater power above nominal, and the new memory."""
         starts = memory.started == 0.0
         applied = np.stack([seen.v_p, seen.Q_H], axis=-1)
@@ -230,9 +230,9 @@ class LQG(MeasuredController):
         slack = np.array([0.0, self.design.heater_slack])
         previous = applied + np.where(starts[:, None], 0.0, np.clip(memory.command - applied, -slack, slack))
         inputs = self.law(state.mean, plan, previous)
-        return inputs[:, 0], inputs[:, 1], Memory(state, plan, inputs, np.ones(len(inputs)))
+        return inputs[:, 0], inputs[:, 1], LQGMemory(state, plan, inputs, np.ones(len(inputs)))
 
-    def model_mismatch(self, memory: Memory) -> Any:
+    def model_mismatch(self, memory: LQGMemory) -> Any:
         """Whether its model does not explain the readings: the innovations have a mean that noise has not."""
         warmth, width = np.abs(memory.filter.surprise).T
         return np.maximum(0.5 * warmth, width) > MISMATCH

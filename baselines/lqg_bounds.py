@@ -20,10 +20,10 @@ from cz_gym.process import scales
 from cz_gym.spaces import STATE, tag
 
 from .clairvoyant import fluctuations_of, pullers_of
-from .lqg import LQG, Gains, LQGDesign, solve_each
+from .lqg import LQG, LQGDesign, LQGGains, solve_each
 from .lqg_estimator import MultipleModelFilter, PlantFilter
 from .lqg_filter import DRIFT, DRIFT_RATE, FAST, PLANT, SLOW, STATES, NoiseModel, load_per_drift
-from .policy import Floats, batched, fresh, to_action
+from .policy import Floats, batched, reset_rows, to_action
 
 _LEAST_SD = 0.01
 """Least standard deviation of a fluctuation [K]: a filter that expects none cannot follow what its model leaves out."""
@@ -39,11 +39,11 @@ class PrivilegedLQG(LQG):
     ``for_episodes`` it is the LQG of the nominal puller.
     """
 
-    gains_by_slot: Gains | None = None
+    gains_by_slot: LQGGains | None = None
     knows_fluctuations: bool = False
 
     @cached_property
-    def gains(self) -> Gains:
+    def gains(self) -> LQGGains:
         """Gains of the slots' own pullers."""
         return super().gains if self.gains_by_slot is None else self.gains_by_slot
 
@@ -65,14 +65,14 @@ class PrivilegedLQG(LQG):
         return replace(self, gains_by_slot=solved)
 
 
-class Exact(NamedTuple):
+class ExactState(NamedTuple):
     """The true state in place of an estimate."""
 
     mean: Floats
     """State of the augmented plant, deviations in SI units, shape (n, 10)."""
 
 
-class TrueState(NamedTuple):
+class TrueStateFilter(NamedTuple):
     """A filter that sees the state and the present disturbances.
 
     It separates the two interface fluctuations, of which the sum is seen, by a noise-free Kalman filter.
@@ -80,13 +80,13 @@ class TrueState(NamedTuple):
 
     models: PlantFilter
 
-    def at_rest(self, n: int) -> Exact:
+    def at_rest(self, n: int) -> ExactState:
         """The state before the first sample of n slots."""
-        return Exact(np.zeros((n, len(STATES))))
+        return ExactState(np.zeros((n, len(STATES))))
 
     def step(
-        self, state: Exact, applied: Floats, drift_moved: Floats, seen: Any, starts: npt.NDArray[np.bool_]
-    ) -> Exact:
+        self, state: ExactState, applied: Floats, drift_moved: Floats, seen: Any, starts: npt.NDArray[np.bool_]
+    ) -> ExactState:
         """The state at a sample, given the one before."""
         dt, before, mean = self.models.dt, state.mean, np.zeros(state.mean.shape)
         radius = seen.r_c_error + seen.r_ref + seen.ring_offset  # of no cost where the ring shows r_ref
@@ -94,7 +94,7 @@ class TrueState(NamedTuple):
         mean[:, [FAST, SLOW]] = _separated(before[:, [FAST, SLOW]], seen.dT_i, starts, self.models.noise, dt)
         mean[:, DRIFT] = _drift(seen.Q_d, self.models.puller)
         mean[:, DRIFT_RATE] = np.where(starts, 0.0, mean[:, DRIFT] - before[:, DRIFT]) / dt
-        return Exact(mean)
+        return ExactState(mean)
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class FullInformation(PrivilegedLQG):
     def estimator(self, n: int) -> Any:
         """The true state of n slots."""
         super().estimator(n)
-        return TrueState(self.gains.filter)
+        return TrueStateFilter(self.gains.filter)
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -115,7 +115,7 @@ class FullInformation(PrivilegedLQG):
         array, single = batched(observation)
         values = (array * scales(STATE, self.v_0, self.heater_range)).T
         seen: Any = SimpleNamespace(**dict(zip((channel.name for channel in STATE), values, strict=True)))
-        pull, power, memory = self.step(seen, fresh(state, self.at_rest(seen), episode_start))
+        pull, power, memory = self.step(seen, reset_rows(state, self.at_rest(seen), episode_start))
         return tag(to_action(pull / self.v_0, power / self.heater_range, single), self.made_for), memory
 
 

@@ -163,7 +163,7 @@ class CompensatedPID(MeasuredController):
 # [K], powers [W], speeds [m/s], all as deviations from the puller's nominal.
 
 
-class Heat(NamedTuple):
+class HeaterMemory(NamedTuple):
     """The memory of the loop; each of shape (n,)."""
 
     integral: Floats
@@ -205,12 +205,14 @@ class TemperatureLoop:
     def __post_init__(self) -> None:
         check_numbers(self, positive=("K", "T_i", "T_track", "T_pull", "T_mean"), not_negative=("K_pull", "limit"))
 
-    def at_rest(self, seen: Measured) -> Heat:
+    def at_rest(self, seen: Measured) -> HeaterMemory:
         """The memory before the first sample: the applied power continues."""
         zero = np.zeros_like(seen.T_1)
-        return Heat(seen.Q_H / self.K, np.copy(seen.Q_H), zero, zero)
+        return HeaterMemory(seen.Q_H / self.K, np.copy(seen.Q_H), zero, zero)
 
-    def step(self, seen: Measured, memory: Heat, dt: float, v_0: float, heater_range: float) -> tuple[Floats, Heat]:
+    def step(
+        self, seen: Measured, memory: HeaterMemory, dt: float, v_0: float, heater_range: float
+    ) -> tuple[Floats, HeaterMemory]:
         """Power above nominal [W], shape (n,), and the new memory; dt in s, v_0 in m/s, the heater's range in W."""
         mean = memory.mean_pull - math.expm1(-dt / self.T_mean) * (seen.v_p / v_0 - memory.mean_pull)
         before = memory.trim if self.K_pull > 0.0 else 0.0
@@ -220,7 +222,7 @@ class TemperatureLoop:
         integral = memory.integral + min(dt / self.T_track, 1.0) * missed
         power = self.K * (error + integral)
         integral = integral + dt / self.T_i * error
-        return power, Heat(integral, np.clip(power, -2.0 * heater_range, 2.0 * heater_range), mean, trim)
+        return power, HeaterMemory(integral, np.clip(power, -2.0 * heater_range, 2.0 * heater_range), mean, trim)
 
 
 # The paper's controller made fit for service: measurement filter, anti-windup, bumpless start, trim of the recipe.
@@ -240,7 +242,7 @@ class FilteredPIDMemory(NamedTuple):
     pid: PIDState
     command: Floats
     """Last commanded pull speed above nominal [m/s]."""
-    heat: Heat
+    heat: HeaterMemory
 
 
 @dataclass(frozen=True)

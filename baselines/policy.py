@@ -39,7 +39,7 @@ class Policy(Protocol):
         ...
 
 
-class State(NamedTuple):
+class ControllerState(NamedTuple):
     """The memory of a :class:`MeasuredController`."""
 
     readings: Measured
@@ -141,13 +141,13 @@ class MeasuredController(ABC):
         seen = self.read(array)
         if state is None or (episode_start is not None and np.any(episode_start)):
             first = type(seen)(*(np.where(np.isfinite(channel), channel, 0.0) for channel in seen))
-            state = fresh(state, State(first, self.at_rest(first)), episode_start)
+            state = reset_rows(state, ControllerState(first, self.at_rest(first)), episode_start)
         good = np.isfinite(array).all() and (seen.valid > 0.5).all()
         read = seen if good else readable(seen, state.readings)
         given = read._replace(T_1=seen.T_1) if self.accepts_missing_temperature else read
         pull, power, memory = self.step(given, state.memory)
         action = to_action(pull / self.v_0, power / self.heater_range, single)
-        return tag(action, self.made_for), State(read, memory)
+        return tag(action, self.made_for), ControllerState(read, memory)
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ def to_action(pull: Floats, heat: Floats, single: bool) -> npt.NDArray[np.float3
     return action[0] if single else action
 
 
-def fresh(state: Any, zeros: Any, episode_start: Any) -> Any:
+def reset_rows(state: Any, zeros: Any, episode_start: Any) -> Any:
     """The state, with ``zeros``, the state at rest, where an episode begins; both are nested tuples of arrays."""
     if state is None:
         return zeros

@@ -58,8 +58,8 @@ class Search:
         config: Config,
         trials: int,
         episodes: int,
-        quick: bool = False,
         measure: Measure | None = None,
+        quick: bool = False,
     ) -> None:
         """At most ``trials`` candidates, each on ``episodes`` training episodes; a ``quick`` search ends at QUICK_STEP,
         and only its finalists have to survive other scenarios.

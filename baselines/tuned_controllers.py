@@ -24,7 +24,7 @@ from cz_gym.puller.file import DEFAULT
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from .analysis import CUT_OFF, LoopMargins, design_compensator, linear_form, loop_margins
-from .crystal import CrystalLQG, CrystalPID, Noise, TrueRadiusPID, Weights
+from .crystal import CrystalLQG, CrystalNoise, CrystalPID, CrystalWeights, TrueRadiusPID
 from .lqg import LQG, LQGDesign
 from .lqg_estimator import Hypotheses
 from .pid import FilteredPID, SeriesPID, TemperatureLoop
@@ -112,9 +112,10 @@ def tuned_pid(limits: tuple[Any, ...], parameters: tuple[Parameter, ...], **fact
         OWN_PULLER: replace(objective, survive=("hard",)),
     }
     near = tuple(each for each in parameters if each.path in ON_PULLER)
+    settings: dict[str, Any] = {"robust": ROBUST, "near": near, "scale": scale_pid} | facts
     return TunedController(
         objectives=objectives, parameters=parameters, begins_with=RANDOMIZED.name,
-        **{"robust": ROBUST, "near": near, "scale": scale_pid} | facts,
+        **settings,
     )  # fmt: skip
 
 
@@ -220,9 +221,11 @@ def tuned_lqg(name: str, meaning: str, limits: dict[str, tuple[float, float]], *
         for scenario, most in limits.items()
     }
     objectives[OWN_PULLER] = lqg_objective(0.3, 0.02, False)
+    settings: dict[str, Any] = {"scale": scale_lqg, "crystals": HALF_HOT_ZONE, "filter_of": FILTER, "candidates": 2}
+    settings |= facts
     return TunedController(
         name=name, meaning=meaning, start=LQGDesign(), parameters=LQG_PARAMETERS, objectives=objectives,
-        **{"scale": scale_lqg, "crystals": HALF_HOT_ZONE, "filter_of": FILTER, "candidates": 2} | facts,
+        **settings,
     )  # fmt: skip
 
 
@@ -406,7 +409,7 @@ CRYSTALS = (
         name="lqg-along",
         meaning="Kalman filters of ring, pyrometer and load cell, and regulators, designed along the recipe",
         start=CrystalLQG(
-            noise=Noise(
+            noise=CrystalNoise(
                 ring=8.073e-5,
                 weight=0.8,
                 height=2.738e-5,
@@ -418,7 +421,7 @@ CRYSTALS = (
                 drift=5.0,
                 recipe=4.503,
             ),
-            weights=Weights(
+            weights=CrystalWeights(
                 radius=0.4 * MM, height=6.531e-4, cones=0.2566, pull=1.527e-6, power=6488.0, power_step=2646.0
             ),
         ),

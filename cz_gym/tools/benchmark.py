@@ -17,8 +17,8 @@ from cz_gym.support.names import unknown_name_message
 from cz_gym.support.units import MM
 from cz_gym.tools.report.markdown import terminal
 
-from . import registry
 from .files import check_targets, write
+from .registry import TASKS
 from .run import check_agents, is_cached, run
 
 CLONE = Path(__file__).resolve().parents[2]
@@ -112,11 +112,6 @@ def folder_of(arguments: argparse.Namespace) -> Path:
     return CRYSTALS if arguments.env == "CzCrystal-v0" else FOLDER
 
 
-def registered(arguments: argparse.Namespace) -> tuple[Contender, ...]:
-    """The controllers of an environment."""
-    return registry.CRYSTAL_CONTROLLERS if arguments.env == "CzCrystal-v0" else registry.CONTROLLERS
-
-
 def benchmark(arguments: argparse.Namespace, command: str) -> int:
     """Check the arguments, run the benchmark, write and print the results."""
     cases = cases_of(arguments)
@@ -133,7 +128,7 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     write(arguments.out, arguments.json, results, command, quoted)
     if not arguments.quiet:
         print(terminal(results))
-        slow = {each.name for each in registered(arguments) if each.slow} - {each.name for each in contenders}
+        slow = {each.name for each in TASKS[arguments.env].known if each.slow} - {each.name for each in contenders}
         if arguments.controllers == ["all"] and slow:
             names = ", ".join(sorted(slow))
             print(f"left out of all: {names}, which are slow and not cached for every episode; add --slow to run them")
@@ -163,7 +158,7 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
     ``--slow`` asks for them, or if they are named and all their episodes cached.
     """
     own, given = [user_code.controller(place) for place in arguments.controller], given_agents(arguments)
-    controllers, shipped = registered(arguments), shipped_names(arguments.env)
+    controllers, shipped = TASKS[arguments.env].known, shipped_names(arguments.env)
     names = [each.name for each in controllers]
     new = [name for name in given if name not in shipped]
     user_code.check_apart([*names, *shipped, *new, *(each.name for each in own)], "controller")
@@ -209,7 +204,7 @@ def given_agents(arguments: argparse.Namespace) -> dict[str, Contender]:
 
 def is_partial(arguments: argparse.Namespace, contenders: Sequence[Contender], cases: Sequence[Case]) -> bool:
     """Whether the run holds less than the default one, or something of the user's own."""
-    usual = {each.name for each in registered(arguments) if each.default and not each.slow}
+    usual = {each.name for each in TASKS[arguments.env].known if each.default and not each.slow}
     usual |= set(shipped_names(arguments.env))
     usual_cases = {case for case in ENVIRONMENTS[arguments.env] if case.default}
     missing = usual - {each.name for each in contenders} or usual_cases - set(cases)

@@ -1,7 +1,8 @@
-"""The classical controllers by name."""
+"""Controllers by name: the classical ones of each environment, and those that tools choose by themselves."""
 
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 from cz_gym.baselines.clairvoyant import Clairvoyant
 from cz_gym.baselines.lqg import LQG, LQGDesign
@@ -115,9 +116,27 @@ CRYSTAL_CONTROLLERS: tuple[Contender, ...] = (
 """Every named controller of ``CzCrystal-v0``, in the order of tables."""
 
 
+class TaskControllers(NamedTuple):
+    """Controllers of a task, and the one that a tool names by itself."""
+
+    known: tuple[Contender, ...]
+    """Every named controller, in the order of tables."""
+    rival: str
+    """Controller that a player is compared with."""
+    rival_meaning: str
+    """Its name in a sentence."""
+
+
+TASKS = {
+    BODY.name: TaskControllers(CONTROLLERS, "paper", "the paper's"),
+    CRYSTAL.name: TaskControllers(CRYSTAL_CONTROLLERS, "compensated", "the compensated"),
+}
+"""Controllers by environment."""
+
+
 def find_controller(name: str, process: Process = BODY) -> Contender:
     """The controller of that name for a process; CzError lists the known ones for another name."""
-    known = CRYSTAL_CONTROLLERS if process == CRYSTAL else CONTROLLERS
+    known = TASKS.get(process.name, TASKS[BODY.name]).known
     for entry in known:
         if entry.name == name:
             return entry

@@ -19,9 +19,9 @@ from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.evaluation.parallel import side_by_side
 from cz_gym.puller.file import FOLDER, PullerFile, chosen_puller
-from cz_gym.support.command_line import OneLineParser, between, shown
+from cz_gym.support.command_line import OneLineParser, between, relative_path
 from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown
+from cz_gym.support.names import unknown_name_message
 
 TUNABLE: dict[str, TunedController] = {each.name: each for each in (*PIDS, *LQGS, *CRYSTALS)}
 Task = tuple[TunedController, PullerFile, int, int, Path]
@@ -64,7 +64,7 @@ def _tune(given: argparse.Namespace) -> None:
     scenario = find_scenario(name)
     tuned = known.get(given.controller)
     if tuned is None:
-        raise CzError(unknown("controller to tune", given.controller, known))
+        raise CzError(unknown_name_message("controller to tune", given.controller, known))
     if tuned.process != BODY and scenario != RANDOMIZED:
         raise CzError(f"{tuned.name} has one search: leave --scenario {name} out")
     config = tuned.search_config(scenario, given.control_interval)
@@ -74,7 +74,7 @@ def _tune(given: argparse.Namespace) -> None:
     print(f"{tuned.name} on {name}: score {chosen.score:.4f} on validation crystals")
     for parameter, value in zip(search.objective.parameters, chosen.values, strict=True):
         print(f"  {parameter.path} = {value:.6g}")
-    print(f"wrote {shown(path)}")
+    print(f"wrote {relative_path(path)}")
 
 
 def tunable(given: argparse.Namespace) -> dict[str, TunedController]:
@@ -88,7 +88,7 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
 
     known = {name: each for name, each in tunable(given).items() if each.near}
     if given.controller not in (None, *known):
-        raise CzError(unknown("controller to tune for a puller", given.controller, known))
+        raise CzError(unknown_name_message("controller to tune for a puller", given.controller, known))
     alike = [each for each in known.values() if each.process.name == given.env]
     searched = [known[given.controller]] if given.controller else alike
     beside = folder_of(puller).absolute()

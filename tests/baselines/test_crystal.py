@@ -3,16 +3,15 @@
 import numpy as np
 import pytest
 
-from cz_gym.baselines.crystal import STATES, Noise, Weights, design, without_ring
+from cz_gym.baselines.crystal import STATES, CrystalNoise, CrystalWeights, design, without_ring
 from cz_gym.baselines.tuned import by_scenario, with_values
-from cz_gym.baselines.tuned_crystal import CRYSTALS
+from cz_gym.baselines.tuned_controllers import CRYSTALS
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.evaluation.metrics import crystal_metrics
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, Case
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.meniscus import HURLE
-from cz_gym.support.errors import CzError
 from cz_gym.tools.registry import CRYSTAL_CONTROLLERS, make_controller
 
 CROWN = Case("crown", "randomized", "a crown", process=CRYSTAL, stage="crown")
@@ -70,7 +69,7 @@ def test_settings_in_proportion_are_the_settings_for_the_default_puller():
 
 def test_filter_and_regulator_are_stable_at_every_length():
     """Whatever the pull speed, the crystal's mass stays: the regulator leaves it alone."""
-    at = design(make_config(process=CRYSTAL).parameters, HURLE, 5.0, 0.5, Noise(), Weights())
+    at = design(make_config(process=CRYSTAL).parameters, HURLE, 5.0, 0.5, CrystalNoise(), CrystalWeights())
     for A, B, C, K, F, _ in zip(*at[1:], strict=True):
         told = np.eye(STATES) - K @ C
         loop = np.block([[A, np.zeros((STATES, 2))], [np.zeros((2, STATES + 2))]]) + np.vstack([B, np.eye(2)]) @ F
@@ -81,7 +80,7 @@ def test_filter_and_regulator_are_stable_at_every_length():
 
 def test_without_the_ring_the_other_sensors_have_gains_of_their_own():
     """Those of a filter with the same covariance of the state that never had a camera."""
-    at = design(make_config(process=CRYSTAL).parameters, HURLE, 5.0, 0.5, Noise(), Weights())
+    at = design(make_config(process=CRYSTAL).parameters, HURLE, 5.0, 0.5, CrystalNoise(), CrystalWeights())
     gain, known = without_ring(at.K, at.S)
     covariance = np.linalg.inv(at.S)
     PC = at.K @ covariance
@@ -91,20 +90,7 @@ def test_without_the_ring_the_other_sensors_have_gains_of_their_own():
         assert np.linalg.slogdet(known[row])[1] == pytest.approx(-np.linalg.slogdet(covariance[row, 1:, 1:])[1])
 
 
-def test_who_runs_on_a_puller_unless_controllers_are_named():
-    runs = [each.name for each in CRYSTAL_CONTROLLERS if each.on_puller]
-    assert runs == ["ring-pid-reduced", "compensated", "lqg-along", "true-radius"]
-
-
-def test_controllers_are_made_for_one_process():
-    crystal, body = make_config(process=CRYSTAL, observation="measured", action="direct"), make_config("randomized")
-    assert make_controller("compensated", crystal).made_for == crystal.made_for
-    with pytest.raises(CzError, match="unknown controller 'compensated'"):
-        make_controller("compensated", body)
-    with pytest.raises(CzError, match="unknown controller 'paper'; choose from recipe, ring-pid"):
-        make_controller("paper", crystal)
-    with pytest.raises(CzError, match="was made for"):
-        rollout(make_controller("compensated", crystal), body, [0])
+def test_a_controller_of_another_puller_acts_on_a_batch():
     germanium = make_config(process=CRYSTAL, puller="germanium", observation="measured", action="direct")
     made = make_controller("lqg-along", germanium)
     action, _ = made.predict(np.zeros((3, len(CRYSTAL.measured)), np.float32))

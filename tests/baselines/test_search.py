@@ -2,19 +2,39 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from cz_gym.baselines.lqg import LQGDesign
 from cz_gym.baselines.pid import FilteredPID
-from cz_gym.baselines.search import Search, measure
-from cz_gym.baselines.tuned import TUNED, Figures, Parameter, by_scenario, file_name, value_at
-from cz_gym.baselines.tuned_crystal import CRYSTALS, SCENARIOS, STAGES, CrystalFigures, priced
-from cz_gym.baselines.tuned_lqg import ACTIVITIES, BEST_RETURN, FAMILY, LQGS, PARAMETERS, lqg_goal
-from cz_gym.baselines.tuned_pid import PIDS, pid_goal
+from cz_gym.baselines.search import Search
+from cz_gym.baselines.tuned import (
+    OWN_PULLER,
+    TUNED,
+    Objective,
+    Parameter,
+    Scores,
+    by_scenario,
+    file_name,
+    measure,
+    value_at,
+)
+from cz_gym.baselines.tuned_controllers import (
+    ACTIVITIES,
+    BEST_RETURN,
+    CRYSTALS,
+    FAMILY,
+    LQG_PARAMETERS,
+    LQGS,
+    PIDS,
+    CrystalScores,
+    lqg_objective,
+    price,
+    price_crystals,
+)
 from cz_gym.config import make_config
-from cz_gym.crystal.process import CRYSTAL
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.puller.file import FOLDER
@@ -22,7 +42,7 @@ from cz_gym.support.errors import CzError
 from cz_gym.tools import tune
 from tests.observed import PLAIN
 
-FIGURES = Figures(0.06, 0.01, 0.02, 0.0, 1900.0, 0.0, 2160)
+SCORES = Scores(0.06, 0.01, 0.02, 0.0, 1900.0, 0.0, 2160)
 CONFIG = make_config("randomized", **PLAIN)
 TWO = Parameter("T_f", 1.0, 100.0), Parameter("K_ff", -1.0, 1.0, log=False)
 
@@ -42,9 +62,16 @@ def bowl(trials=40, episodes=4, parameters=TWO):
     def figures(policy, config, seeds):
         met.append(policy)
         error = np.log10(policy.T_f / 10.0) ** 2 + (policy.K_ff - 0.5) ** 2
-        return FIGURES._replace(rmse_mm=float(error) if seeds[0] < 1_000_000 else 1.0 / policy.T_f, pull_step=0.0)
+        return SCORES._replace(rmse_mm=float(error) if seeds[0] < 1_000_000 else 1.0 / policy.T_f, pull_step=0.0)
 
-    return Search("bowl", pid_goal(FilteredPID(), parameters), CONFIG, trials, episodes, figures), met
+    return Search(
+        "bowl",
+        Objective(price, (), 5.0, 2.0, start=FilteredPID(), parameters=parameters),
+        CONFIG,
+        trials,
+        episodes,
+        figures,
+    ), met
 
 
 def test_validation_chooses_among_the_best_of_training(tmp_path):
@@ -119,20 +146,20 @@ def test_a_search_keeps_the_control_interval_and_puller_of_its_environment(tuned
 
     def figures(policy, config, seeds):
         met.append((policy.made_for, config.made_for))
-        return FIGURES
+        return SCORES
 
-    search = Search(tuned.name, tuned.goal(RANDOMIZED), config, 1, 10, figures)
+    search = Search(tuned.name, tuned.objective(RANDOMIZED), config, 1, 10, figures)
     search.add(search.first)
-    assert len(met) == 1 + len(search.goal.survive)
+    assert len(met) == 1 + len(search.objective.survive)
     assert set(met) == {(config.made_for, config.made_for)}
 
 
 def test_a_search_is_not_continued_on_other_crystals_or_at_another_interval(tmp_path, monkeypatch):
-    goal, path = PIDS[0].goal(RANDOMIZED), tmp_path / "search.json"
+    goal, path = PIDS[0].objective(RANDOMIZED), tmp_path / "search.json"
 
     def search(scenario, dt):
         config = make_config(scenario, control_interval=dt, **PLAIN)
-        return Search(PIDS[0].name, goal, config, 2, 10, lambda *_: FIGURES)
+        return Search(PIDS[0].name, goal, config, 2, 10, lambda *_: SCORES)
 
     search("randomized", 2.0).tune(path)
     tried = path.read_bytes()
@@ -150,8 +177,8 @@ def test_a_search_is_not_continued_on_other_crystals_or_at_another_interval(tmp_
 @pytest.mark.parametrize("tuned", PIDS, ids=name)
 def test_every_parameter_sets_what_it_names_and_a_search_begins_with_the_settings_of_randomized(tuned, scenario):
     """But for an infinite jump, which is clipped to the range of its parameter."""
-    search = Search(tuned.name, tuned.goal(find_scenario(scenario)), make_config(scenario, **PLAIN), 1, 5)
-    parameters = search.goal.parameters
+    search = Search(tuned.name, tuned.objective(find_scenario(scenario)), make_config(scenario, **PLAIN), 1, 5)
+    parameters = search.objective.parameters
     values = [0.5 * (each.low + each.high) for each in parameters]
     assert [value_at(search.settings(values), each.path) for each in parameters] == values
     highest = max((each.high for each in parameters if each.path == "jump"), default=None)
@@ -162,18 +189,18 @@ def test_every_parameter_sets_what_it_names_and_a_search_begins_with_the_setting
 # LQGs
 
 START = LQGDesign()
-GOAL = lqg_goal(START, PARAMETERS, ("hard", "puller"), 0.07, 0.02, True)
+GOAL = replace(lqg_objective(0.07, 0.02, True, ("hard", "puller")), start=START, parameters=LQG_PARAMETERS)
 
 
 def logarithms(design):
-    return np.log([value_at(design, parameter.path) for parameter in PARAMETERS])
+    return np.log([value_at(design, parameter.path) for parameter in LQG_PARAMETERS])
 
 
 def made_up(policy, config=CONFIG, seeds=()):
     """Best return where every parameter is twice its default, radius error within its limit below the default."""
     away = logarithms(policy.design) - logarithms(START) - np.log(2.0)
     rmse = 0.07 * np.exp(0.1 * (away[0] + np.log(2.0)))
-    return FIGURES._replace(rmse_mm=float(rmse), mean_return=2000.0 - 20.0 * float(away @ away))
+    return SCORES._replace(rmse_mm=float(rmse), mean_return=2000.0 - 20.0 * float(away @ away))
 
 
 def test_cobyla_comes_near_the_optimum_inside_the_limits():
@@ -205,7 +232,7 @@ def test_a_search_uses_training_and_validation_seeds_only(tmp_path):
         return made_up(policy)
 
     config = make_config("puller", **PLAIN)
-    goal = replace(BEST_RETURN.goal(config.scenario), start=START)
+    goal = replace(BEST_RETURN.objective(config.scenario), start=START)
     Search("lqg", goal, config, 15, 10, watched).tune(tmp_path / "lqg.json")
     survived = {*range(100_000, 100_020)}
     assert met == {"puller": {*range(10), *survived, *VALIDATION_SEEDS[:20]}}
@@ -215,23 +242,23 @@ def test_a_search_uses_training_and_validation_seeds_only(tmp_path):
 
 HEATER_STEP = [*by_scenario("lqg")["randomized"]].index("weights.heater_step")
 SEARCHES = [(each, scenario) for each in PIDS for scenario in TUNED if scenario.name in by_scenario(each.name)]
-SEARCHES += [(each, find_scenario(scenario)) for each in LQGS for scenario in each.limits]
+SEARCHES += [(each, find_scenario(scenario)) for each in LQGS for scenario in each.objectives if scenario != OWN_PULLER]
 
 
 @pytest.mark.parametrize(("tuned", "scenario"), SEARCHES, ids=name)
 def test_shipped_settings_are_those_a_search_chose(tuned, scenario):
     """Finalists of the searches that chose the LQGs were also tried with heavier weights on heater steps."""
     found, varied = kept(tuned.name, scenario.name), []
-    config = make_config(tuned.crystals(scenario), **PLAIN)
-    search = Search(tuned.name, tuned.goal(scenario), config, 1, 5)
+    config = tuned.search_config(scenario)
+    search = Search(tuned.name, tuned.objective(scenario), config, 1, 5)
     values = found["chosen"]["values"]
-    assert list(values) == [parameter.path for parameter in search.goal.parameters]
+    assert list(values) == [parameter.path for parameter in search.objective.parameters]
     chosen = search.settings(values.values())
     if tuned in PIDS:
         assert chosen == tuned.settings(scenario)
     else:
         varied = [HEATER_STEP]
-        assert chosen == tuned.design(scenario)
+        assert chosen == tuned.settings(scenario)
         assert not found["chosen"]["figures"]["failure_rate"]
     history = [np.delete(tried, varied).tolist() for tried, *_ in found["history"]]
     assert np.delete([*values.values()], varied).tolist() in history
@@ -241,19 +268,19 @@ def test_shipped_settings_are_those_a_search_chose(tuned, scenario):
 @pytest.mark.parametrize("tuned", CRYSTALS, ids=name)
 def test_controllers_of_whole_crystals_have_what_a_search_chose(tuned):
     found = kept(tuned.name, "randomized")
-    config = make_config(SCENARIOS, process=CRYSTAL, stage=STAGES, **PLAIN)
-    search = Search(tuned.name, tuned.goal, config, 1, 5)
+    config = tuned.search_config(RANDOMIZED)
+    search = Search(tuned.name, tuned.objective(RANDOMIZED), config, 1, 5)
     chosen = found["chosen"]["values"]
-    assert list(chosen) == [parameter.path for parameter in search.goal.parameters]
+    assert list(chosen) == [parameter.path for parameter in search.objective.parameters]
     assert search.settings(chosen.values()).for_config(config) == tuned.make(config)
     assert [*chosen.values()] in [tried for tried, *_ in found["history"]]
     assert found["history"][0][0] == list(search.first)
     assert found["scenario_hash"] == config.scenario.hash
-    figures = CrystalFigures(**found["chosen"]["figures"])
-    assert found["chosen"]["score"] == pytest.approx(priced(figures))
+    figures = CrystalScores(**found["chosen"]["figures"])
+    assert found["chosen"]["score"] == pytest.approx(price_crystals(figures, None))
 
 
-@pytest.mark.parametrize("scenario", LQGS[-1].limits)
+@pytest.mark.parametrize("scenario", [each.name for each in TUNED])
 def test_the_family_has_less_error_the_more_it_may_move(scenario):
     """But for the most active member on puller, where the drive limits the steps."""
     found = [kept(each, scenario)["chosen"]["figures"] for each in FAMILY[1:]]
@@ -275,7 +302,7 @@ def test_the_family_has_less_error_the_more_it_may_move(scenario):
     ],
 )
 def test_the_command_writes_what_the_search_chose(name, said, trials, scenario, monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(tune, "measure", lambda policy, config, seeds: FIGURES)
+    monkeypatch.setattr(tune, "Search", partial(Search, measure=lambda policy, config, seeds: SCORES))
     arguments = ["--controller", name, "--trials", f"{trials}", "--control-interval", "2", "--out", str(tmp_path)]
     assert tune.main(arguments) == 0
     written = json.loads((tmp_path / f"{name}.json").read_text())

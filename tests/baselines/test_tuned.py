@@ -1,32 +1,77 @@
-"""Controllers for another puller: the paper's procedure, proportions, what a search keeps, and the commands."""
+"""Settings follow what a scenario contains, whatever its name is."""
 
 import json
 import os
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from cz_gym import make_puller
 from cz_gym.agents import load
-from cz_gym.baselines import tuned_crystal
 from cz_gym.baselines.analysis import close, linear_form
+from cz_gym.baselines.lqg_filter import RingModel, ring_of
 from cz_gym.baselines.pid import CompensatedPID
-from cz_gym.baselines.tuned import Figures, value_at
-from cz_gym.baselines.tuned_crystal import CRYSTALS, CrystalFigures
-from cz_gym.baselines.tuned_pid import PAPER_TUNED, PIDS, paper_here, scaled
+from cz_gym.baselines.scaling import scale_pid
+from cz_gym.baselines.search import Search
+from cz_gym.baselines.tuned import TUNED, Scores, by_scenario, value_at
+from cz_gym.baselines.tuned_controllers import BEST_RETURN, CRYSTALS, LQGS, PAPER_TUNED, PIDS, CrystalScores, paper_here
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.episodes.scenarios import RANDOMIZED
+from cz_gym.episodes.scenario import Sensor
+from cz_gym.episodes.scenarios import PULLER, RANDOMIZED, SCENARIOS, SENSOR_FAULT
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.puller.file import FOLDER, find_puller, write_puller
 from cz_gym.support.errors import CzError
-from cz_gym.support.units import HOUR
+from cz_gym.support.units import HOUR, MINUTE, MM
 from cz_gym.tools import tune
 from cz_gym.tools.benchmark import main as benchmark
 from cz_gym.tools.registry import find_controller, make_controller
 from tests.observed import PLAIN
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
+def test_named_scenarios_have_their_own_settings_or_those_of_randomized(scenario):
+    for tuned in (*LQGS, *PIDS):
+        values = by_scenario(tuned.name).get(scenario.name, by_scenario(tuned.name)["randomized"])
+        settings = tuned.settings(scenario)
+        assert {path: value_at(settings, path) for path in values} == values
+
+
+@pytest.mark.parametrize("scenario", TUNED, ids=[each.name for each in TUNED])
+def test_another_name_changes_nothing(scenario):
+    other = replace(scenario, name="mine", drift=replace(scenario.drift, amount=(-1.0, 1.0)))
+    for name in ("lqg", "lqg-at-0.02", "paper-tuned"):
+        ours, theirs = (make_controller(name, make_config(each, **PLAIN)) for each in (other, scenario))
+        assert ours == theirs
+
+
+def test_the_model_of_the_camera_follows_the_scenario():
+    rotation = 8.0 / MINUTE, 15.0 / MINUTE
+    slow = replace(PULLER, name="slow", sensor=replace(PULLER.sensor, latency=2.0, ripple=(0.0, 0.1 * MM)))
+    assert BEST_RETURN.settings(slow).ring == RingModel(2.0, 0.04 * MM, rotation=rotation)
+    for sensor, ring in (
+        (RANDOMIZED.sensor, None),
+        (PULLER.sensor, RingModel(5.0, 0.08 * MM, rotation=rotation)),
+        (Sensor(latency=3.0), RingModel(3.0, 0.0, rotation=Sensor().rotation)),
+    ):
+        assert ring_of(sensor) == ring
+
+
+def test_a_warning_names_what_no_settings_were_tuned_for():
+    scenario = replace(PULLER, name="both", faults=SENSOR_FAULT.faults)
+    for name in ("lqg", "paper-tuned"):
+        with pytest.warns(UserWarning, match=rf"{name} was not tuned for faults\.flagged, .* of scenario 'both'"):
+            controller = make_controller(name, make_config(scenario, **PLAIN))
+        assert controller == make_controller(name, make_config("puller", **PLAIN))
+    late = replace(PULLER, name="late", sensor=replace(PULLER.sensor, latency=20.0))
+    with pytest.warns(UserWarning, match=r"tuned for sensor\.latency of scenario 'late': it has .* for 'puller'"):
+        assert BEST_RETURN.settings(late).ring.latency == 20.0
+
+
+# Controllers for another puller: the paper's procedure, proportions, what a search keeps, and the commands
 
 WIDE = make_config(puller="silicon-300mm", **PLAIN)
 
@@ -40,17 +85,17 @@ def test_on_the_default_puller_the_papers_procedure_gives_the_papers_numbers():
 
 def on_puller(tuned, config):
     """The settings that the record scales to a puller, before any search for it."""
-    return scaled(tuned.settings(RANDOMIZED), config)
+    return scale_pid(tuned.settings(RANDOMIZED), config)
 
 
 @pytest.mark.parametrize("tuned", PIDS, ids=[each.name for each in PIDS])
-def test_on_the_default_puller_nothing_is_scaled(tuned):
+def test_on_the_default_puller_nothing_is_scale_pid(tuned):
     assert on_puller(tuned, make_config(**PLAIN)) == tuned.settings(RANDOMIZED)
 
 
 def test_a_puller_made_of_the_defaults_file_by_other_numbers_is_scaled_to():
     config = make_config(puller=replace(find_puller("default"), name="mine", heater_range=5e3), **PLAIN)
-    for tuned in (each for each in PIDS if each.on_puller):
+    for tuned in (each for each in PIDS if each.scale):
         assert tuned.make(config) == on_puller(tuned, config)
 
 
@@ -104,8 +149,8 @@ def test_what_was_found_is_used_for_that_puller_alone(tmp_path):
 def test_one_command_designs_and_another_runs_it(tmp_path, monkeypatch, capsys):
     place = tmp_path / "mine.toml"
     write_puller(find_puller("silicon-300mm"), place)
-    figures = Figures(0.1, 0.01, 0.01, 0.1, 1900.0, 0.0, 5400)
-    monkeypatch.setattr(tune, "measure", lambda policy, config, seeds: figures)
+    figures = Scores(0.1, 0.01, 0.01, 0.1, 1900.0, 0.0, 5400)
+    monkeypatch.setattr(tune, "Search", partial(Search, measure=lambda policy, config, seeds: figures))
     monkeypatch.setattr(tune, "side_by_side", lambda function, tasks, *_: enumerate(map(function, tasks)))
     assert tune.main(["--puller", str(place), "--trials", "10"]) == 0
     for name in ("lqg-at-0.02", "paper-tuned", "pid-conventional"):
@@ -136,9 +181,9 @@ def test_whole_crystals_of_a_puller_have_searches_of_their_own(tmp_path, monkeyp
     write_puller(find_puller("silicon-300mm"), place)
 
     def figures(policy, config, seeds):
-        return CrystalFigures(policy.control_interval, 0.5, 0.1, 0.01, 0.02)
+        return CrystalScores(policy.control_interval, 0.5, 0.1, 0.01, 0.02)
 
-    monkeypatch.setattr(tuned_crystal, "measure", figures)
+    monkeypatch.setattr(tune, "Search", partial(Search, measure=figures))
     monkeypatch.setattr(tune, "side_by_side", lambda function, tasks, *_: enumerate(map(function, tasks)))
     assert tune.main(["--puller", str(place), "--trials", "14", "--env", "CzCrystal-v0"]) == 0
     assert "crown's largest errors 2.00 mm, tail's 0.50 mm, 2 % lost" in capsys.readouterr().out

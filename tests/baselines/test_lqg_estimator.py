@@ -9,7 +9,7 @@ from cz_gym.baselines.analysis import close, linear_form
 from cz_gym.baselines.clairvoyant import pullers_of
 from cz_gym.baselines.lqg import LQG, LQGDesign
 from cz_gym.baselines.lqg_estimator import Hypotheses, multiple_model_filter
-from cz_gym.baselines.tuned_lqg import FACTORS, adaptive
+from cz_gym.baselines.tuned_controllers import FACTORS, adaptive
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface
 from cz_gym.evaluation.rollout import rollout
