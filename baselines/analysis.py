@@ -1,4 +1,4 @@
-"""Sampled loops, linearised from the code that runs: a controller's ``predict`` and the plant.
+"""Linear analysis of loops: sampled ones from the code that runs, Part II's compensator design, margins.
 
 The state space of a controller comes from its own ``predict``, called with one unit of each memory entry and of each
 observation channel; its memory must be a NamedTuple of arrays. So the margins are those of the shipped code. Timing is
@@ -66,7 +66,7 @@ class Loop(NamedTuple):
 
     @property
     def stable(self) -> bool:
-        """Whether every pole lies inside the unit circle."""
+        """Stability: every pole lies inside the unit circle."""
         return float(np.abs(np.linalg.eigvals(self.A)).max()) < 1.0
 
     def pick(self, output: str, inputs: tuple[str, ...]) -> StateSpace:
@@ -187,7 +187,7 @@ def stable_range(
     return (end(1.0 / WIDEST), end(WIDEST)) if stable(1.0) else (math.nan, math.nan)
 
 
-# Part II's design of the compensator from a linear model of the plant, and the margins of its continuous loop.
+# Part II's design of the compensator, and the margins of its continuous loop
 
 CUT_OFF = Compensator().slow
 """The paper's high-pass cut-off [rad/s]."""
@@ -207,7 +207,7 @@ class Margins(NamedTuple):
 
     @property
     def stable(self) -> bool:
-        """Whether every closed-loop pole lies in the left half plane."""
+        """Stability: every closed-loop pole lies in the left half plane."""
         return bool(np.all(self.poles.real < 0.0))
 
 
@@ -259,7 +259,7 @@ def margins(model: RadiusModel, compensator: Compensator | None, pid: SeriesPID)
     return Margins(float(crossover), float(phase), poles[np.argsort(np.abs(poles))])
 
 
-# Margins of sampled loops, computed by python-control from their frequency response.
+# Margins of sampled loops
 
 SLOWEST = 1e-4
 """Lowest frequency [rad/s]: a period of 17 hours, slower than the drift of any episode."""
@@ -334,7 +334,7 @@ def _pick(values: Any, which: Any) -> float:
     return float(which(values)) if len(values) else float("nan")
 
 
-# The state space of a shipped controller near rest, without what keeps its code from being linear there.
+# Shipped controllers near rest, without the parts of their code that are not linear there
 
 SETTLING = 720
 """Number of samples after which a filter's covariance has settled."""

@@ -1,4 +1,9 @@
-"""The future of an episode, from the environment's own draws and schedules, which only bounds may read."""
+"""The clairvoyant: the lowest bound, an optimal trajectory for known parameters, state and future disturbances.
+
+The future of an episode comes from the environment's own draws and schedules, which only bounds may read. Newton steps
+by Riccati sweeps find the trajectory, interior points keep it within limits. Its inputs are applied; the optimum's own
+feedback on the true state corrects what the plan does not contain: a heater that moves in steps.
+"""
 
 import math
 from collections.abc import Sequence
@@ -103,10 +108,10 @@ def _keys(seeds: Sequence[int]) -> list[Key]:
     return [first_key(int(seed)) for seed in seeds]
 
 
-# The optimal trajectory of an episode with a known future: Newton steps by Riccati sweeps, limits by interior points.
+# The optimal trajectory by direct multiple shooting (docs/controllers/bounds.md)
 #
-# Direct multiple shooting (docs/controllers/bounds.md): all steps are linearised at once, by complex step through the
-# environment's own equations, and solved in a time that grows with their number, not its cube.
+# All steps are linearised at once, by complex step through the environment's own equations, and solved in a time that
+# grows with their number, not its cube.
 
 STATES, INPUTS = len(State._fields), len(Inputs._fields)
 SCALES = np.array([MM, MM, 1.0, 1.0, 1.0, MM_PER_MIN, KILO])
@@ -201,7 +206,7 @@ class Trajectory(NamedTuple):
 
     @property
     def converged(self) -> npt.NDArray[np.bool_]:
-        """Whether the search for the optimum ended, shape (n,)."""
+        """True where the search for the optimum ended, shape (n,)."""
         return self.last_move < TOLERANCE
 
 
@@ -325,10 +330,7 @@ def _height_fraction(h_c: Floats, change: Floats, future: Future) -> Floats:
     return fraction
 
 
-# The lowest bound: the optimal trajectory for known parameters, state and future disturbances.
-#
-# Its inputs are applied; the optimum's own feedback on the true state corrects what the plan does not contain: a
-# heater that moves in steps.
+# The controller that follows it
 
 _CHANNELS = tuple(channel.name for channel in STATE)
 _X = ("r_c_error", "h_c", "T_1", "T_2", "T_b")
@@ -375,7 +377,7 @@ class OptimalInputs:
     inputs_0: Floats
     """Inputs at the operating point, shape (n, 2)."""
     ranges: Floats
-    """What an action of 1 moves pull speed [m/s] and heater power [W] by."""
+    """Range of an action: pull speed [m/s] and heater power [W] that 1 stands for."""
     made_for: TargetEnv
 
     def predict(

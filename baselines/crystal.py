@@ -1,8 +1,14 @@
-"""PIDs of a whole crystal on the bright ring: with gains that change in the cones, and a compensator that runs along.
+"""Controllers of a whole crystal: PIDs on the bright ring with gains that change in the cones, and an LQG.
 
 The ring moves with the meniscus height as well as with the radius, in the crown ten times as much as in the body. The
 compensator predicts the height's deviation from the recipe from the applied pull speed and takes its share off the
 ring, with both numbers scheduled on the length. Radii [m], speeds [m/s], temperatures [K], power [W].
+
+The LQG solves Kalman filter and regulator for the linearisation at lengths of the recipe, as if the crystal stayed
+there, and interpolates between, once for each of several shares of conduction. The filter reads ring, pyrometer and
+load cell: a radius that is too small and a meniscus that is too high look alike to the camera in the crown, but weigh
+differently. Three states are not the plant's: the interface's slow fluctuation, the drift of the hot zone, which the
+given recipe follows, and the error of that recipe.
 """
 
 import math
@@ -47,7 +53,7 @@ class CrystalPIDMemory(NamedTuple):
     """Last commanded pull speed above the recipe's [m/s]."""
     heat: HeaterMemory
     start: Floats
-    """What the pyrometer showed above the recipe at the first sample [K]."""
+    """Pyrometer above the recipe at the first sample [K]."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +71,7 @@ class CrystalPID(MeasuredController):
     cone_gain: float = 1.0
     """Gain of the error in crown and tail [-]."""
     compensates: bool = True
-    """Whether the predicted height is taken off the ring."""
+    """Takes the predicted height off the ring."""
     lam: float = 0.5
     """Share of conduction in its model [-]."""
     slow: float = 2.0e-4
@@ -111,7 +117,7 @@ class CrystalPID(MeasuredController):
 
 @dataclass(frozen=True)
 class TrueRadiusPID(CrystalPID):
-    """The same on the true radius, which no sensor shows: a bound."""
+    """PID on the true radius, which no sensor shows: a bound."""
 
     observation: ClassVar[str] = "state"
 
@@ -128,13 +134,7 @@ class TrueRadiusPID(CrystalPID):
         )
 
 
-# A linear quadratic Gaussian regulator of a whole crystal: Kalman filter and regulator at each length of the recipe.
-#
-# Both are solved for the linearisation at some lengths, as if the crystal stayed there, and interpolated between, once
-# for each of several shares of conduction. The filter reads ring, pyrometer and load cell: a radius that is too small
-# and a meniscus that is too high look alike to the camera in the crown, but weigh differently. The model has three
-# states that are not the plant's: the interface's slow fluctuation, the drift of the hot zone, which the recipe that
-# is given follows, and the error of that recipe. SI units.
+# The LQG, in SI units
 
 REGULATED, STATES, DRIVES = 8, 9, 2
 """r_c, h_c, T_1, T_2, T_b, then the fluctuation, the drift and the recipe's error [K], then the crystal's mass [kg],
@@ -149,7 +149,7 @@ _SEEN = np.array([MM, 1.0, 1.0])
 
 
 class CrystalNoise(NamedTuple):
-    """What the filter expects."""
+    """Noise and walks that the filter expects."""
 
     ring: float = 0.06 * MM
     """Noise of the ring [m]."""
@@ -160,7 +160,7 @@ class CrystalNoise(NamedTuple):
     height: float = 2.0e-7
     """Walk of the height in the body, for what the model lacks [m/sqrt(s)]."""
     cones: float = 1.0
-    """The same in crown and tail, in multiples of the body's [-]."""
+    """Walk of the height in crown and tail, in multiples of the body's [-]."""
     temperature: float = 3.0e-3
     """Walk of each temperature [K/sqrt(s)]."""
     mass: float = 1.0e-4
@@ -178,7 +178,7 @@ class CrystalNoise(NamedTuple):
 
 
 class CrystalWeights(NamedTuple):
-    """What the regulator weighs: deviations that cost 1."""
+    """Deviations that cost 1 in the regulator."""
 
     radius: float = 0.5 * MM
     height: float = 0.4 * MM

@@ -1,7 +1,10 @@
-"""Linear-quadratic regulator with costs on input moves, known disturbances and a previewed reference.
+"""Linear-quadratic-Gaussian control of pull speed and heater together: regulator, filter and their design.
 
-The disturbance states, which drive the plant and are not moved by it, enter by a Sylvester equation: in the Riccati
-equation an integrating disturbance would be unstabilisable.
+The regulator has costs on input moves, known disturbances and a previewed reference.
+
+The disturbance states, which drive
+the plant and are not moved by it, enter by a Sylvester equation: in the Riccati equation an integrating disturbance
+would be unstabilisable.
 """
 
 from collections.abc import Sequence
@@ -111,7 +114,7 @@ def look_ahead(plan: Floats, seen: Measured, starts: npt.NDArray[np.bool_], dt: 
     return moved
 
 
-# Linear-quadratic-Gaussian control of pull speed and heater together: filter, regulator and their design.
+# The controller
 
 
 @dataclass(frozen=True)
@@ -124,7 +127,7 @@ class LQGDesign:
     lam: float = 0.5
     """Share of conduction at the design point [-]."""
     nonlinear: bool = True
-    """Whether the filters predict with the plant's equations, or with the linearised ones."""
+    """Predicts with the plant's equations; False: with the linearised ones."""
     gate: float = 4.0
     """Limit of the innovations, in standard deviations [-]."""
     heater_slack: float = 0.06 * KILO
@@ -151,7 +154,7 @@ class LQGGains(NamedTuple):
 
     filter: PlantFilter
     regulator: Regulator
-    """Its arrays have a leading axis n for one puller a slot."""
+    """Arrays with a leading axis n for one puller a slot."""
 
 
 class LQGMemory(NamedTuple):
@@ -200,7 +203,7 @@ class LQG(MeasuredController):
 
     @property
     def exportable(self) -> bool:
-        """Whether it has a single filter."""
+        """True for an LQG with a single filter."""
         return self.hypotheses is None
 
     @cached_property
@@ -233,7 +236,7 @@ class LQG(MeasuredController):
         return inputs[:, 0], inputs[:, 1], LQGMemory(state, plan, inputs, np.ones(len(inputs)))
 
     def model_mismatch(self, memory: LQGMemory) -> Any:
-        """Whether its model does not explain the readings: the innovations have a mean that noise has not."""
+        """True where the model does not explain the readings: the innovations have a mean that noise has not."""
         warmth, width = np.abs(memory.filter.surprise).T
         return np.maximum(0.5 * warmth, width) > MISMATCH
 

@@ -55,7 +55,7 @@ class PrivilegedLQG(LQG):
         return super().estimator(n)
 
     def for_episodes(self, config: Config, seeds: Sequence[int]) -> Self:
-        """The same controller for those episodes, one a slot."""
+        """Return the controller that knows those episodes, one a slot."""
         designs = [self.design] * len(seeds)
         if self.knows_fluctuations:
             sds = np.maximum(fluctuations_of(config, seeds), _LEAST_SD).tolist()

@@ -19,7 +19,6 @@ from cz_gym.support.names import map_arrays, select
 from cz_gym.support.units import KILO, MINUTE
 
 from . import lqg_filter
-from . import lqg_filter as ring_model
 from .lqg_filter import (
     DRIFT,
     FAST,
@@ -52,7 +51,7 @@ class FilterState(NamedTuple):
     mean: Floats
     """Estimated state of the augmented plant, deviations in SI units, shape (n, states)."""
     covariance: Floats
-    """Its covariance, shape (n, states, states)."""
+    """Covariance of the estimate, shape (n, states, states)."""
     camera_variance: Floats
     """Estimated variance of the camera's noise [m2], shape (n,)."""
     ripple: RippleSearch
@@ -85,7 +84,7 @@ class PlantFilter(NamedTuple):
         start = np.broadcast_to(self.plant.start, (n, states, states)).copy()
         if self.ring is not None and self.ring.has_ripple and not self.ring.frequency_known:
             start = _without_ripple(start, np.ones(n, np.bool_))
-        search = ring_model.search_at_rest(n, self.ring, self.dt)
+        search = lqg_filter.search_at_rest(n, self.ring, self.dt)
         return FilterState(np.zeros((n, states)), start, np.full(n, self.noise.camera_sd**2), search, np.zeros((n, 2)))
 
     def step(
@@ -145,7 +144,7 @@ class PlantFilter(NamedTuple):
         now, row = self._expected_ring(mean)
         if self.ring is None:
             return now, row
-        delivered = ring_model.delivered_row(row, self.ring, self.dt)
+        delivered = lqg_filter.delivered_row(row, self.ring, self.dt)
         samples, oldest = self.ring.delay(self.dt)
         newest = (1.0, 1.0 - oldest, 0.0)[min(samples, 2)]
         return newest * now + np.einsum("ni,ni->n", mean[:, RIPPLE:], delivered[:, RIPPLE:]), delivered
@@ -153,7 +152,7 @@ class PlantFilter(NamedTuple):
     def _expected_ring(self, mean: Floats) -> tuple[Floats, Floats]:
         """The present ring minus its nominal [m], shape (n,), and its derivative by the state, shape (n, states)."""
         H = self.plant.H[..., 0, :]
-        slope = H if self.ring is None else ring_model.undelayed_row(self.plant, self.ring, self.dt)
+        slope = H if self.ring is None else lqg_filter.undelayed_row(self.plant, self.ring, self.dt)
         if not self.nonlinear:
             row = np.broadcast_to(slope, mean.shape)
             return np.einsum("ni,ni->n", mean, row), row
@@ -175,7 +174,7 @@ class PlantFilter(NamedTuple):
     def _moved_ring(self, state: FilterState, ring: RingModel) -> tuple[Floats, Floats]:
         """Ripple and past rings one interval later, shape (n, states - 10), and the covariance of all states."""
         now, row = self._expected_ring(state.mean)
-        A = ring_model.transition(self.plant.A, row, state.ripple.omega, ring, self.dt)
+        A = lqg_filter.transition(self.plant.A, row, state.ripple.omega, ring, self.dt)
         mean = (A @ state.mean[..., None])[..., 0]
         if ring.first_past < mean.shape[1]:
             mean[:, ring.first_past] = now
@@ -188,7 +187,7 @@ class PlantFilter(NamedTuple):
         self, state: FilterState, residual: Floats, valid: npt.NDArray[np.bool_], ring: RingModel
     ) -> FilterState:
         """One more sample of the search for the ripple's frequency; slots that find it begin to estimate the ripple."""
-        search, new, ripple = ring_model.search_step(state.ripple, residual, valid, ring, self.dt)
+        search, new, ripple = lqg_filter.search_step(state.ripple, residual, valid, ring, self.dt)
         if not new.any():
             return state._replace(ripple=search)
         mean, covariance = state.mean.copy(), _without_ripple(state.covariance, new)
@@ -221,10 +220,10 @@ def _without_ripple(covariance: Floats, where: npt.NDArray[np.bool_]) -> Floats:
     return reduced
 
 
-# Multiple-model estimation: a bank of the LQG's filters, weighted by how well each predicts the ring.
+# Multiple-model estimation
 #
-# Each filter assumes one pair of standard deviations of the interface fluctuations, whose strength differs from
-# crystal to crystal. Bayes' rule gives its probability (Magill 1965), and the estimate is the mean over the filters.
+# Each filter of a bank assumes one pair of standard deviations of the interface fluctuations, whose strength differs
+# from crystal to crystal. Bayes' rule gives its probability (Magill 1965), and the estimate is the mean over the filters.
 
 
 @dataclass(frozen=True)

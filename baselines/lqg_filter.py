@@ -1,4 +1,7 @@
-"""An extended Kalman filter for a batch of slots, each with its own covariance, one scalar measurement at a time."""
+"""Parts of the LQG's filter: the Kalman update, the model of the plant, and the model of a late, rippling ring.
+
+The update takes one scalar measurement at a time, for a batch of slots, each with its own covariance.
+"""
 
 import math
 from dataclasses import dataclass
@@ -62,7 +65,7 @@ def matched_variance(
     return np.where(valid, np.clip(matched, *limits), variance)
 
 
-# The LQG's model of the plant: linearised, sampled, and augmented by disturbance states.
+# The model of the plant: linearised, sampled, and augmented by disturbance states
 #
 # x = (r_c, h_c, T_1, T_2, T_b, fast, slow, drift, drift_rate, heater), deviations from the operating point, SI units:
 # two Ornstein-Uhlenbeck fluctuations of the interface temperature [K], the hot zone's drift p [K], its rate [K/s] (a
@@ -177,7 +180,7 @@ def _continuous(puller: Puller, noise: NoiseModel, meniscus: MeniscusModel) -> t
     return F, G, H
 
 
-# A camera with latency and a ring that ripples with the crystal's rotation, as states of the LQG's plant model.
+# A camera with latency, and a ring that ripples with the crystal's rotation, as states of that model
 #
 # Latency: the rings of past samples are states. Ripple: an oscillator with a slowly wandering phase, at the rotation's
 # frequency, aliased by sampling, which is found as the peak in the spectrum of the ring's residual.
@@ -212,12 +215,12 @@ class RingModel:
 
     @property
     def has_ripple(self) -> bool:
-        """Whether there is a ripple."""
+        """True for a ring with ripple."""
         return self.ripple_sd > 0.0
 
     @property
     def frequency_known(self) -> bool:
-        """Whether the ripple's frequency is known."""
+        """True for a rotation that is known, and so the ripple's frequency."""
         return self.rotation[0] == self.rotation[1]
 
     @property

@@ -1,4 +1,6 @@
-"""The paper's controller: parallel compensator, series PID on pull speed, PI on heater temperature.
+"""PIDs on the bright ring: the paper's controller as printed, and the one made fit for service.
+
+Both have a parallel compensator, a series PID on pull speed and a PI loop on the heater's temperature.
 
 Bukhari, Hovd and Winkler, Part II, equations of the compensator and of K(s), Table 1. Lead and integrator of K are
 discretised by Tustin's rule, the compensator by zero-order hold, the temperature loop by forward Euler; every state
@@ -157,7 +159,7 @@ class CompensatedPID(MeasuredController):
         return pull, power, PIDMemory(compensator, pid, heat)
 
 
-# The heater of a puller: a PI loop on the pyrometer, and automatic growth control.
+# The heater: a PI loop on the pyrometer, and automatic growth control
 #
 # Automatic growth control raises the temperature's set-point while the mean pull speed is above nominal. Temperatures
 # [K], powers [W], speeds [m/s], all as deviations from the puller's nominal.
@@ -225,9 +227,7 @@ class TemperatureLoop:
         return power, HeaterMemory(integral, np.clip(power, -2.0 * heater_range, 2.0 * heater_range), mean, trim)
 
 
-# The paper's controller made fit for service: measurement filter, anti-windup, bumpless start, trim of the recipe.
-#
-# With ``compensator=None`` it is a conventional PID. Radii [m], speeds [m/s], temperatures [K], power [W].
+# Fit for service: measurement filter, anti-windup, bumpless start, trim of the recipe
 
 
 class FilteredPIDMemory(NamedTuple):
@@ -249,7 +249,8 @@ class FilteredPIDMemory(NamedTuple):
 class FilteredPID(MeasuredController):
     """v_p = v_0 + K F e + feed-forward, with e = r_tilde - r_target and F = 1/(1 + T_f s).
 
-    r_target = r_ref + ring_lead d(r_ref)/dt. The error at the first sample is subtracted and returns over T_start, and
+    r_target = r_ref + ring_lead d(r_ref)/dt; with ``compensator=None`` it is a conventional PID. The error at the first
+    sample is subtracted and returns over T_start, and
     the integrator starts at the applied pull speed, so that switching on moves no drive. The integrator follows the
     applied pull speed (window, slew rate, drive limits) within T_track.
     """

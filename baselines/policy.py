@@ -59,13 +59,13 @@ class MeasuredController(ABC):
     """
 
     process: ClassVar[Process] = BODY
-    """What it controls."""
+    """Process that the controller acts on."""
     observation: ClassVar[str] = "measured"
     """Observation that it reads."""
     action: ClassVar[str] = "direct"
     """Meaning of its actions."""
     accepts_missing_temperature: ClassVar[bool] = False
-    """Whether missing pyrometer readings arrive as NaN, and not as the last reading."""
+    """Receives missing pyrometer readings as NaN, and not as the last reading."""
 
     control_interval: float = 5.0
     """Time between actions [s]."""
@@ -76,7 +76,7 @@ class MeasuredController(ABC):
     puller: PullerFile = field(default=DEFAULT, kw_only=True)
     """The machine that it is for."""
     any_environment: bool = field(default=False, kw_only=True)
-    """Whether every environment takes its actions (``made_for`` is None)."""
+    """Lets every environment take the actions (``made_for`` is None)."""
 
     def __post_init__(self) -> None:
         positive("control_interval", self.control_interval)
@@ -88,12 +88,12 @@ class MeasuredController(ABC):
 
     @property
     def heater_range(self) -> float:
-        """What an action of 1 moves the heater by [W]."""
+        """Heater power that an action of 1 stands for [W]."""
         return self.puller.power_range
 
     @property
     def exportable(self) -> bool:
-        """Whether its step is one straight line of arithmetic, which other languages can have too."""
+        """True if `step` can be traced for export: no branch or loop on data."""
         return True
 
     @cached_property
@@ -116,7 +116,7 @@ class MeasuredController(ABC):
         return given | {name: own for name, (own, default) in plant.items() if own != default}
 
     def for_config(self, config: Config) -> Self:
-        """The same controller for the control interval and the puller of an environment."""
+        """Return the controller for the control interval and the puller of an environment."""
         names = "control_interval", "parameters", "meniscus", "puller"
         return replace(self, **{name: getattr(config, name) for name in names})
 

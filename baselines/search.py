@@ -39,7 +39,7 @@ class Trial(NamedTuple):
     values: tuple[float, ...]
     """Values of the parameters, in their order."""
     score: float
-    """What the search minimises."""
+    """Cost with the prices of missed limits and lost crystals."""
     facts: dict[str, Any]
     """Figures behind the score."""
 

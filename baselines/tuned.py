@@ -140,7 +140,7 @@ class Parameter(NamedTuple):
     low: float
     high: float
     log: bool = True
-    """Whether the range is searched logarithmically."""
+    """Searches the range logarithmically."""
 
     def coordinate(self, value: float) -> float:
         """The place of a value in the space of the search."""
@@ -267,7 +267,7 @@ class TunedController:
     begins_with: str = ""
     """Scenario whose settings its searches begin with; by default the scenario of the search, "start" for the start."""
     one_for_all: bool = False
-    """Whether the settings for ``randomized`` serve every scenario."""
+    """Has the settings for ``randomized`` on every scenario."""
     filter_of: str = ""
     """Controller whose filter, searched for a puller, it has there; empty if the search is its own."""
     candidates: int = 6
@@ -275,15 +275,15 @@ class TunedController:
     episodes: int = 20
     """Training episodes of a candidate of a search for a puller."""
     default: bool = True
-    """Whether a benchmark that names no controllers runs it."""
+    """Runs in a benchmark that names no controllers."""
     quoted: bool = False
-    """Whether it stands in short tables."""
+    """Stands in short tables."""
     on_puller: bool = True
-    """Whether a benchmark on a puller of the user's own that names no controllers runs it."""
+    """Runs in a benchmark on a puller of the user's own that names no controllers."""
 
     @property
     def process(self) -> Process:
-        """What it controls."""
+        """Process that the controller acts on."""
         process: Process = getattr(self.start, "process", BODY)
         return process
 

@@ -280,7 +280,7 @@ FAMILY = tuple(each.name for each in LQGS[1:-1])
 
 
 def adaptive(plain: LQG) -> LQG:
-    """The same LQG with a bank of filters, for FACTORS times its standard deviations of the interface fluctuations."""
+    """Give an LQG a bank of filters, for FACTORS times its standard deviations of the interface fluctuations."""
     noise = plain.design.noise
     fast, slow = (tuple(factor * sd for factor in FACTORS) for sd in (noise.fast_sd, noise.slow_sd))
     return replace(plain, hypotheses=Hypotheses(fast, slow))
@@ -339,7 +339,7 @@ class CrystalScores(NamedTuple):
     crown_mm: float
     """Mean of the crown's largest errors in the :data:`WORST` crystals [mm]."""
     tail_mm: float
-    """The same of the tail [mm]."""
+    """Mean of the tail's largest errors in those crystals [mm]."""
     body_outside: float
     """Share of the body's length with an error beyond 0.5 mm [-]."""
     pull_step: float

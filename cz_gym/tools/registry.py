@@ -124,7 +124,7 @@ class TaskControllers(NamedTuple):
     rival: str
     """Controller that a player is compared with."""
     rival_meaning: str
-    """Its name in a sentence."""
+    """Name of the rival in a sentence."""
 
 
 TASKS = {

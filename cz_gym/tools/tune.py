@@ -82,23 +82,28 @@ def tunable(given: argparse.Namespace) -> dict[str, TunedController]:
     return {name: each for name, each in TUNABLE.items() if given.env in (BODY.name, each.process.name)}
 
 
+def tasks_for(given: argparse.Namespace, puller: PullerFile) -> list[Task]:
+    """The searches for a puller that the command line asks for; CzError names what cannot be searched."""
+    known = {name: each for name, each in tunable(given).items() if each.near}
+    if given.controller not in (None, *known):
+        raise CzError(unknown_name_message("controller to tune for a puller", given.controller, known))
+    if puller.file and puller.file.resolve().parent == FOLDER.resolve():
+        raise CzError(f"{puller.name} ships with what was designed for it: to search anew, copy {puller.file}")
+    alike = [each for each in known.values() if each.process.name == given.env]
+    searched = [known[given.controller]] if given.controller else alike
+    folder = (given.out or folder_of(puller)).absolute()
+    return [
+        (each, puller, given.trials or each.candidates * len(each.near), given.episodes or each.episodes, folder)
+        for each in searched
+    ]
+
+
 def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
     """Search for a puller, several controllers side by side, and print what was chosen."""
     from tqdm import tqdm
 
-    known = {name: each for name, each in tunable(given).items() if each.near}
-    if given.controller not in (None, *known):
-        raise CzError(unknown_name_message("controller to tune for a puller", given.controller, known))
-    alike = [each for each in known.values() if each.process.name == given.env]
-    searched = [known[given.controller]] if given.controller else alike
-    beside = folder_of(puller).absolute()
-    if puller.file and puller.file.resolve().parent == FOLDER.resolve():
-        raise CzError(f"{puller.name} ships with what was designed for it: to search anew, copy {puller.file}")
-    folder = (given.out or beside).absolute()
-    tasks: list[Task] = []
-    for each in searched:
-        trials = given.trials or each.candidates * len(each.near)
-        tasks.append((each, puller, trials, given.episodes or each.episodes, folder))
+    tasks = tasks_for(given, puller)
+    process, folder, beside = tasks[0][0].process, tasks[0][-1], folder_of(puller).absolute()
     with tqdm(total=sum(task[2] for task in tasks), unit="candidate", dynamic_ncols=True, disable=None) as bar:
 
         def poll_progress() -> None:
@@ -110,7 +115,7 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
             bar.write(f"{tuned.name}: {tuned.objectives[OWN_PULLER].kind(**chosen.facts['figures'])}")
     command = f"cz-gym benchmark --puller {shlex.quote(str(puller.file or puller.name))}"
     moved = "" if folder == beside else f"moved to {beside}, "
-    env = "" if searched[0].process == BODY else f" --env {searched[0].process.name}"
+    env = "" if process == BODY else f" --env {process.name}"
     print(f"wrote {folder}: {moved}{command}{env} runs what was designed")
 
 

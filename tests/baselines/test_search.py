@@ -11,7 +11,6 @@ from cz_gym.baselines.lqg import LQGDesign
 from cz_gym.baselines.pid import FilteredPID
 from cz_gym.baselines.search import Search
 from cz_gym.baselines.tuned import (
-    OWN_PULLER,
     TUNED,
     Objective,
     Parameter,
@@ -32,7 +31,6 @@ from cz_gym.baselines.tuned_controllers import (
     CrystalScores,
     lqg_objective,
     price,
-    price_crystals,
 )
 from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
@@ -241,43 +239,26 @@ def test_a_search_uses_training_and_validation_seeds_only(tmp_path):
 # Shipped settings
 
 HEATER_STEP = [*by_scenario("lqg")["randomized"]].index("weights.heater_step")
-SEARCHES = [(each, scenario) for each in PIDS for scenario in TUNED if scenario.name in by_scenario(each.name)]
-SEARCHES += [(each, find_scenario(scenario)) for each in LQGS for scenario in each.objectives if scenario != OWN_PULLER]
+SEARCHES = [(each, find_scenario(kept)) for each in (*PIDS, *LQGS, *CRYSTALS) for kept in by_scenario(each.name)]
 
 
 @pytest.mark.parametrize(("tuned", "scenario"), SEARCHES, ids=name)
 def test_shipped_settings_are_those_a_search_chose(tuned, scenario):
     """Finalists of the searches that chose the LQGs were also tried with heavier weights on heater steps."""
-    found, varied = kept(tuned.name, scenario.name), []
-    config = tuned.search_config(scenario)
-    search = Search(tuned.name, tuned.objective(scenario), config, 1, 5)
-    values = found["chosen"]["values"]
+    found, config = kept(tuned.name, scenario.name), tuned.search_config(scenario)
+    search, values = Search(tuned.name, tuned.objective(scenario), config, 1, 5), found["chosen"]["values"]
     assert list(values) == [parameter.path for parameter in search.objective.parameters]
-    chosen = search.settings(values.values())
-    if tuned in PIDS:
-        assert chosen == tuned.settings(scenario)
-    else:
-        varied = [HEATER_STEP]
-        assert chosen == tuned.settings(scenario)
-        assert not found["chosen"]["figures"]["failure_rate"]
+    assert search.settings(values.values()) == tuned.settings(scenario)
+    varied = [HEATER_STEP] if tuned in LQGS else []
     history = [np.delete(tried, varied).tolist() for tried, *_ in found["history"]]
     assert np.delete([*values.values()], varied).tolist() in history
     assert found["scenario_hash"] == config.scenario.hash
-
-
-@pytest.mark.parametrize("tuned", CRYSTALS, ids=name)
-def test_controllers_of_whole_crystals_have_what_a_search_chose(tuned):
-    found = kept(tuned.name, "randomized")
-    config = tuned.search_config(RANDOMIZED)
-    search = Search(tuned.name, tuned.objective(RANDOMIZED), config, 1, 5)
-    chosen = found["chosen"]["values"]
-    assert list(chosen) == [parameter.path for parameter in search.objective.parameters]
-    assert search.settings(chosen.values()).for_config(config) == tuned.make(config)
-    assert [*chosen.values()] in [tried for tried, *_ in found["history"]]
-    assert found["history"][0][0] == list(search.first)
-    assert found["scenario_hash"] == config.scenario.hash
-    figures = CrystalScores(**found["chosen"]["figures"])
-    assert found["chosen"]["score"] == pytest.approx(price_crystals(figures, None))
+    if tuned in LQGS:
+        assert not found["chosen"]["figures"]["failure_rate"]
+    if tuned in CRYSTALS:
+        assert found["history"][0][0] == list(search.first)
+        score = search.objective.score(CrystalScores(**found["chosen"]["figures"]), None)
+        assert found["chosen"]["score"] == pytest.approx(score)
 
 
 @pytest.mark.parametrize("scenario", [each.name for each in TUNED])
