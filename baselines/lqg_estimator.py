@@ -223,7 +223,7 @@ def _without_ripple(covariance: Floats, where: npt.NDArray[np.bool_]) -> Floats:
 # Multiple-model estimation
 #
 # Each filter of a bank assumes one pair of standard deviations of the interface fluctuations, whose strength differs
-# from crystal to crystal. Bayes' rule gives its probability (Magill 1965), and the estimate is the mean over the filters.
+# from crystal to crystal. Bayes' rule gives its probability (Magill 1965); the estimate is the mean over the filters.
 
 
 @dataclass(frozen=True)

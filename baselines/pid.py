@@ -250,9 +250,8 @@ class FilteredPID(MeasuredController):
     """v_p = v_0 + K F e + feed-forward, with e = r_tilde - r_target and F = 1/(1 + T_f s).
 
     r_target = r_ref + ring_lead d(r_ref)/dt; with ``compensator=None`` it is a conventional PID. The error at the first
-    sample is subtracted and returns over T_start, and
-    the integrator starts at the applied pull speed, so that switching on moves no drive. The integrator follows the
-    applied pull speed (window, slew rate, drive limits) within T_track.
+    sample is subtracted and returns over T_start, and the integrator starts at the applied pull speed, so that
+    switching on moves no drive. It follows the applied pull speed (window, slew rate, drive limits) within T_track.
     """
 
     pid: SeriesPID = field(default_factory=SeriesPID)
