@@ -5,7 +5,6 @@
 :func:`cz_gym.config.make_config`, slots hold the crystals.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from typing import Any, Self
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
-from gymnasium.error import InvalidAction, ResetNeeded
+from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -29,7 +28,7 @@ from cz_gym.support.errors import CzError
 from cz_gym.support.names import check_keywords, unknown_name_message
 
 from .config import Config, check_config, make_config, positive_whole
-from .spaces import TaggedAction, action_space, check_action, check_tagged, observation_space
+from .spaces import TaggedAction, action_space, check_action, check_actions, check_tagged, observation_space
 
 Array = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
@@ -387,7 +386,7 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         """
         if type(actions) is TaggedAction:
             check_tagged(actions, self._made_for)
-        actions = self._check_actions(actions)
+        actions = check_actions(actions, self._batch.actions)
         if not self._begun:
             raise ResetNeeded("call reset() first")
         waiting = self._waiting
@@ -479,22 +478,6 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         if not self._begun and not mask.all():
             raise ResetNeeded("the first reset must be of every slot")
         return mask.copy()
-
-    def _check_actions(self, actions: Any) -> npt.NDArray[np.float64]:
-        """Copy the actions into the batch's float64 array and return it; raise InvalidAction for anything else."""
-        array = self._batch.actions
-        try:
-            shape = np.shape(actions)
-            if shape == array.shape:
-                array[:] = actions
-        except (TypeError, ValueError):
-            raise InvalidAction(f"actions must be numbers of shape {array.shape}, not {actions!r}") from None
-        if shape != array.shape:
-            raise InvalidAction(f"actions must have shape {array.shape}, not {shape}")
-        if math.isnan(array.min()):
-            slots = np.flatnonzero(np.isnan(array).any(axis=1))[:10].tolist()
-            raise InvalidAction(f"actions must not be NaN; those of slots {slots} are")
-        return array
 
     def _draw(self, which: list[int], out: Out, given: Distribution | None = None) -> None:
         self._batch.reset(which, (new_key(self._random(i)) for i in which), out, given)

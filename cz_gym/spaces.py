@@ -99,6 +99,22 @@ def check_action(action: Any) -> Any:
     return array
 
 
+def check_actions(actions: Any, array: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Copy a batch's actions into ``array``, shape (n, 2), and return it; raise InvalidAction for anything else."""
+    try:
+        shape = np.shape(actions)
+        if shape == array.shape:
+            array[:] = actions
+    except (TypeError, ValueError):
+        raise InvalidAction(f"actions must be numbers of shape {array.shape}, not {actions!r}") from None
+    if shape != array.shape:
+        raise InvalidAction(f"actions must have shape {array.shape}, not {shape}")
+    if math.isnan(array.min()):
+        slots = np.flatnonzero(np.isnan(array).any(axis=1))[:10].tolist()
+        raise InvalidAction(f"actions must not be NaN; those of slots {slots} are")
+    return array
+
+
 class TargetEnv(NamedTuple):
     """The environment that a controller or an agent was made for."""
 

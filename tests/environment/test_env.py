@@ -25,7 +25,7 @@ from cz_gym.spaces import tag
 from tests.observed import PLAIN
 
 MM_PER_MIN = 1e-3 / 60
-ZERO = np.zeros(2, np.float32)
+P = make_puller()
 
 
 def test_everything_advertised_is_there():
@@ -144,22 +144,27 @@ def test_out_of_range_actions_are_clipped_and_said_so():
     assert runs[0] == runs[1]
 
 
+def infos(env, actions, seed=0):
+    """Infos of a reset and of a step with each of the actions."""
+    return [env.reset(seed=seed)[1], *(env.step(np.array(action, np.float32))[4] for action in actions)]
+
+
+def drives(found):
+    """Pull speed, in shares of v_0, and heater power [W] above nominal, in infos of the default puller."""
+    pull, power = np.array([(info["v_p"], info["Q_H"]) for info in found]).T
+    return pull / P.v_0 - 1.0, power - P.Q_H_0
+
+
 def test_actions_are_pull_speed_and_power():
-    env, p = CzEnv("nominal", info="all", **PLAIN), make_puller()
-    _, start = env.reset(seed=0)
-    assert (start["v_p"], start["Q_H"]) == (p.v_0, p.Q_H_0)
-    for pull, heat in ((1.0, 0.0), (-1.0, 1.0), (0.5, -0.25)):
-        *_, info = env.step(np.array([pull, heat], np.float32))
-        assert info["v_p"] / MM_PER_MIN == pytest.approx(1.2 * (1 + pull))
-        assert info["Q_H"] - p.Q_H_0 == pytest.approx(10e3 * heat)
+    pull, power = drives(infos(CzEnv("nominal", info="all", **PLAIN), [(1.0, 0.0), (-1.0, 1.0), (0.5, -0.25)]))
+    assert (pull[0], power[0]) == (0.0, 0.0)
+    assert pull[1:] == pytest.approx([1.0, -1.0, 0.5], abs=1e-12)
+    assert power[1:] == pytest.approx([0.0, 10e3, -2.5e3])
 
 
 def test_info_is_the_plant_in_si():
     env = CzEnv("only-interface", model=0.3, info="all", **PLAIN)
-    env.reset(seed=2)
-    p = make_puller(lam=0.3)
-    for _ in range(5):
-        *_, info = env.step(np.array([0.2, 0.0], np.float32))
+    p, info = make_puller(lam=0.3), infos(env, [(0.2, 0.0)] * 5, seed=2)[-1]
     slot = env.get_state().slot.slot
     x = State(info["r_c"], info["h_c"], info["T_1"], math.nan, info["T_b"])
     grown = growth(x, Disturbance(0.0, float(slot["dT_i"]), 1.0), p, cz_gym.HURLE.slope)
@@ -174,55 +179,35 @@ def test_drives_obey_window_slew_and_steps():
     limits = Actuators(
         pull_window=0.5 * MM_PER_MIN, pull_slew=0.3 * MM_PER_MIN / 60, heater_slew=2000.0 / 60, heater_step=100.0
     )
-    env, p = CzEnv(Scenario("mine", actuators=limits), info="all", **PLAIN), make_puller()
-    env.reset(seed=0)
-    infos = [env.step(np.array([1.0, 0.553], np.float32))[4] for _ in range(60)]
-    pull = np.array([(info["v_p"] - p.v_0) / MM_PER_MIN for info in infos])
-    power = np.array([info["Q_H"] - p.Q_H_0 for info in infos])
+    env = CzEnv(Scenario("mine", actuators=limits), info="all", **PLAIN)
+    pull, power = drives(infos(env, [(1.0, 0.553)] * 60 + [(-1.0, 0.0)] * 60)[1:])
     t = 5.0 * np.arange(1, 61)
-    np.testing.assert_allclose(pull, np.minimum(0.3 * t / 60, 0.5), atol=1e-9)
-    slewed = np.minimum(2000.0 * t / 60, 5530.0)
-    np.testing.assert_allclose(power, 100 * np.rint(slewed / 100), atol=1e-6)
-    back = [env.step(np.array([-1.0, 0.0], np.float32))[4] for _ in range(60)]
-    assert min(info["v_p"] for info in back) == pytest.approx(p.v_0 - 0.5 * MM_PER_MIN)
-
-
-P = make_puller()
+    np.testing.assert_allclose(1.2 * pull[:60], np.minimum(0.3 * t / 60, 0.5), atol=1e-9)
+    np.testing.assert_allclose(power[:60], 100 * np.rint(np.minimum(2000.0 * t / 60, 5530.0) / 100), atol=1e-6)
+    assert 1.2 * pull[60:].min() == pytest.approx(-0.5)
 
 
 @pytest.mark.parametrize("interval", [2.0, 5.0, 10.0])
 def test_a_held_action_is_approached_with_one_time_constant(interval):
     """v_p -> v_0 (1 + a) and Q_H -> Q_H0 + 5 kW a, whatever the control interval."""
     env = CzEnv("nominal", action="smooth", control_interval=interval, horizon=600.0, info="all")
-    env.reset(seed=0)
-    for k in range(round(100.0 / interval)):
-        *_, info = env.step(np.array([0.4, -0.5], np.float32))
-        reached = 1.0 - math.exp(-(k + 1) * interval / 50.0)
-        assert info["v_p"] / P.v_0 - 1.0 == pytest.approx(0.4 * reached, rel=1e-5)
-        assert info["Q_H"] - P.Q_H_0 == pytest.approx(5e3 * -0.5 * reached, rel=1e-5)
-    for _ in range(round(100.0 / interval)):
-        *_, info = env.step(np.zeros(2, np.float32))
-    assert info["v_p"] / P.v_0 - 1.0 == pytest.approx(0.4 * (math.exp(-2.0) - math.exp(-4.0)), rel=1e-5)
+    steps = round(100.0 / interval)
+    pull, power = drives(infos(env, [(0.4, -0.5)] * steps + [(0.0, 0.0)] * steps))
+    reached = 1.0 - np.exp(-np.arange(1, steps + 1) * interval / 50.0)
+    assert pull[1 : steps + 1] == pytest.approx(0.4 * reached, rel=1e-5)
+    assert power[1 : steps + 1] == pytest.approx(-2.5e3 * reached, rel=1e-5)
+    assert pull[-1] == pytest.approx(0.4 * (math.exp(-2.0) - math.exp(-4.0)), rel=1e-5)
 
 
 @pytest.mark.parametrize("interval", [2.0, 10.0])
 def test_rates_add_up_within_the_range_of_the_drives(interval):
     """An action of 1 moves the pull speed by v_0 and the heater by 5 kW every 50 s; left alone they stay."""
     env = CzEnv("nominal", action="rate", control_interval=interval, horizon=600.0, info="all")
-    env.reset(seed=0)
-    steps = round(20.0 / interval)
-    for action, pull, power in (
-        (-0.5, -0.2, -1e3),
-        (0.0, -0.2, -1e3),
-        (-1.0, -0.6, -3e3),
-        (-1.0, -1.0, -5e3),
-        (-1.0, -1.0, -7e3),
-    ):
-        for _ in range(steps):
-            _, _, over, _, info = env.step(np.full(2, action, np.float32))
-        assert info["v_p"] / P.v_0 - 1.0 == pytest.approx(pull, abs=1e-5)
-        assert info["Q_H"] - P.Q_H_0 == pytest.approx(power, rel=1e-5)
-    assert not over
+    held = [action for action in (-0.5, 0.0, -1.0, -1.0, -1.0) for _ in range(round(20.0 / interval))]
+    pull, power = drives(infos(env, [(action, action) for action in held])[:: round(20.0 / interval)])
+    assert pull[1:] == pytest.approx([-0.2, -0.2, -0.6, -1.0, -1.0], abs=1e-5)
+    assert power[1:] == pytest.approx([-1e3, -1e3, -3e3, -5e3, -7e3], rel=1e-5)
+    env.step(np.zeros(2))  # which an episode that is over refuses
 
 
 def test_info_is_lean_unless_all_is_asked_for():
