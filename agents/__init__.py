@@ -23,7 +23,7 @@ DEFAULT = "gradient"
 
 
 def load(name: str | Path = DEFAULT, config: Config | None = None) -> OnnxPolicy:
-    """A trained agent, ready for ``predict``: a shipped one by its name, or an agent file (.onnx).
+    """Load a trained agent, ready for ``predict``: a shipped one by its name, or an agent file (.onnx).
 
     With a config, the agent must be made for its plant, observation, actions and control interval; without,
     ``gym.make(agent.contract.environment, **agent.settings)`` makes an environment for the agent. AgentFileError says

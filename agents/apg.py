@@ -1,4 +1,4 @@
-"""A step of the batch as a function that torch differentiates, for networks of any shape, and the cost of a step."""
+"""Analytic policy gradients (APG): a differentiable plant step, its cost, a recurrent policy, and the algorithm."""
 
 import math
 from itertools import pairwise
@@ -135,16 +135,16 @@ class RecurrentPolicy(BasePolicy):
         self.optimizer = torch.optim.Adam(self.parameters(), lr=lr_schedule(1.0), betas=betas)
 
     def initial_memory(self, n: int) -> torch.Tensor:
-        """The memory of n crystals that begin, shape (n, means + units)."""
+        """Memory of n crystals that begin, shape (n, means + units)."""
         return torch.zeros(n, self.means + self.gru.hidden_size)
 
     def update_means(self, measured: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Features, shape (n, features), and leaky means after a reading, shape (n, channels)."""
+        """Return features, shape (n, features), and leaky means after a reading, shape (n, channels)."""
         means = memory[:, : self.means] * self.keep + measured @ self.gain
         return torch.cat([measured, means], dim=1) @ self.differences, means
 
     def forward(self, measured: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """The action, shape (n, 2), unclipped, and the memory after a reading, shape (n, channels)."""
+        """Return the action, shape (n, 2), unclipped, and the memory after a reading, shape (n, channels)."""
         features, means = self.update_means(measured, memory)
         x = torch.clamp((features - self.mean) / self.std.clamp(*STD_RANGE), -FEATURE_LIMIT, FEATURE_LIMIT)
         h = self.gru(x, memory[:, self.means :])
@@ -272,7 +272,7 @@ class APG(BaseAlgorithm):
         self.policy = policy(self.observation_space, self.action_space, self.lr_schedule, **options).to(self.device)
 
     def _config(self) -> Config:
-        """The settings of the environment that is learned on."""
+        """Settings of the environment that is learned on."""
         try:
             config: Config = self.get_env().get_attr("config")[0]  # type: ignore[union-attr]  # None: said below
         except AttributeError:
@@ -352,7 +352,7 @@ class APG(BaseAlgorithm):
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[np.ndarray, Any]:
-        """The action and the policy's memory, to be passed on as ``state``."""
+        """Return the action and the policy's memory, to be passed on as ``state``."""
         return self.policy.predict(observation, state, episode_start, deterministic)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -47,7 +47,7 @@ class Layout(NamedTuple):
 
 @cache
 def layout(width: int) -> Layout:
-    """The layout of that many channels: of "history" and the true state of the environment that has so many of both."""
+    """Find the environment whose "history" and true state have that many channels; CzError if none has."""
     for process in ENVIRONMENTS.values():
         history, state = observations(process)["history"], process.state
         if width == len(history) + len(state):
@@ -66,7 +66,7 @@ class Asymmetric(BasePolicy):
         super().__init__(observation_space, *others, **named)
 
     def predict(self, observation: Any, *others: Any, **named: Any) -> Any:
-        """As stable-baselines3's; the true state may be missing from the observation."""
+        """Act as stable-baselines3's policies do; the true state may be missing from the observation."""
         missing = self.width - observation.shape[-1]
         padding = ((0, 0),) * (observation.ndim - 1) + ((0, missing),)
         return super().predict(np.pad(observation, padding), *others, **named)
@@ -96,11 +96,11 @@ class AsymmetricSACPolicy(Asymmetric, SACPolicy):
     """
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
-        """The actor, on the sensors and the estimate."""
+        """Make the actor, on the sensors and the estimate."""
         return super().make_actor(StateEstimator(self.observation_space))
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
-        """The critics, on the true state and its products."""
+        """Make the critics, on the true state and its products."""
         settings = self._update_features_extractor(self.critic_kwargs, StateFeatures(self.observation_space))
         return StateCritic(**settings).to(self.device)
 
@@ -120,7 +120,7 @@ class StateCritic(ContinuousCritic):
             self.add_module(f"qf{place}", self.q_networks[place])
 
     def forward(self, obs: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """One value a critic, each of shape (n, 1)."""
+        """Return the value of each critic, of shape (n, 1)."""
         sight: Any = self.features_extractor
         state = torch.cat([sight.state(obs), actions], dim=1)
         products = (actions[:, :, None] * state[:, None, :]).flatten(1)
@@ -151,12 +151,12 @@ class StateEstimator(BaseFeaturesExtractor):
         self.estimate = nn.Sequential(*create_mlp(self.channels, len(known.unknown), [128, 128]))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """Shape (n, at least the channels of "history") to (n, features)."""
+        """Map observations (n, at least the channels of "history") to features (n, features)."""
         seen = observations[:, : self.channels] * self.gains
         return torch.cat([seen[:, : self.layout.present], self.estimate(seen).detach()], dim=1)
 
     def loss(self, observations: torch.Tensor) -> torch.Tensor:
-        """Huber's loss of the estimate; the true state follows the channels of "history"."""
+        """Huber loss of the estimate; the true state follows the channels of "history"."""
         seen, state = observations[:, : self.channels], observations[:, self.channels :]
         return huber_loss(self.estimate(seen * self.gains), state[:, self.layout.unknown] * self.state_gains)
 
@@ -179,11 +179,11 @@ class StateFeatures(BaseFeaturesExtractor):
         self.register_buffer("pairs", pairs, persistent=False)
 
     def state(self, observations: torch.Tensor) -> torch.Tensor:
-        """The true state within +-4, shape (n, channels of the state)."""
+        """Scale the true state and clip it to +-4, shape (n, channels of the state)."""
         return (observations * self.gains)[:, len(self.layout.history) :].clamp(-4.0, 4.0)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """Shape (n, channels of "history" and of the state) to (n, features)."""
+        """Map observations (n, channels of "history" and of the state) to features (n, features)."""
         state = self.state(observations)
         products = 0.5 * state[:, self.pairs[0]] * state[:, self.pairs[1]]
         return torch.cat([observations * self.gains, products], dim=1)

@@ -1,4 +1,4 @@
-"""The contract of an agent file, the JSON beside each ONNX file; and reading and writing both."""
+"""Contract of an agent file, the JSON beside each ONNX file; reading and writing of both."""
 
 import hashlib
 import json
@@ -58,7 +58,7 @@ class Contract:
     algorithm: str
     """Name of the recipe that trained it."""
     learned_from: str
-    """What it was told in training, in words of :mod:`cz_gym.evaluation.protocol`: REWARD, STATE or PLANT."""
+    """Source of the learning, in words of :mod:`cz_gym.evaluation.protocol`: REWARD, STATE or PLANT."""
     training_seed: int
     """Seed of the training run."""
     training_steps: int
@@ -76,7 +76,7 @@ class Contract:
 
 
 ADDED_FIELDS = {"puller": DEFAULT.label, "environment": "Cz-v0"}
-"""Fields that older files do not have, and what is true of those."""
+"""Fields that older files do not have, with the values that hold for those."""
 
 
 def observation_hash(name: str, environment: str = "Cz-v0") -> str:
@@ -87,7 +87,7 @@ def observation_hash(name: str, environment: str = "Cz-v0") -> str:
 
 
 def facts_of(config: Config) -> dict[str, Any]:
-    """The fields of a contract that follow from the environment's settings."""
+    """Fields of a contract that follow from the environment's settings."""
     return {
         "observation": config.observation,
         "channels": len(observations(config.process)[config.observation]),
@@ -103,7 +103,7 @@ def facts_of(config: Config) -> dict[str, Any]:
 
 
 def make_contract(onnx_bytes: bytes, **facts: Any) -> Contract:
-    """The contract of an ONNX file; ``facts`` are its fields without the hashes of observation and file.
+    """Make the contract of an ONNX file; ``facts`` are its fields without the hashes of observation and file.
 
     AgentFileError for a value that no contract may hold.
     """
@@ -115,7 +115,7 @@ def make_contract(onnx_bytes: bytes, **facts: Any) -> Contract:
 
 
 def agent_files(path: Path, onnx_bytes: bytes, contract: Contract) -> dict[Path, bytes]:
-    """The contents of ``path`` (.onnx) and of its contract (.json)."""
+    """Contents of the files ``path`` (.onnx) and its contract (.json)."""
     text = json.dumps({"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(contract)}, indent=2) + "\n"
     return {path: onnx_bytes, path.with_suffix(".json"): text.encode()}
 
@@ -128,7 +128,7 @@ def write_agent(path: Path, onnx_bytes: bytes, **facts: Any) -> Contract:
 
 
 def read_agent(path: Path) -> tuple[Contract, bytes]:
-    """The contract and the ONNX bytes of an agent file; AgentFileError says what is wrong."""
+    """Read an agent file: its contract and ONNX bytes. AgentFileError says what is wrong."""
     onnx_bytes = read_bounded(path, MAX_BYTES)
     contract = _parse(path.with_suffix(".json"))
     if hashlib.sha256(onnx_bytes).hexdigest() != contract.sha256:
@@ -137,7 +137,7 @@ def read_agent(path: Path) -> tuple[Contract, bytes]:
 
 
 def read_bounded(path: Path, limit: int) -> bytes:
-    """The contents of a regular file of at most ``limit`` bytes; AgentFileError for others, also pipes and devices."""
+    """Read a regular file of at most ``limit`` bytes; AgentFileError for others, also pipes and devices."""
     try:
         # O_NONBLOCK: opening a pipe would wait for a writer. O_BINARY: Windows would end the file at a Ctrl-Z.
         flags = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
@@ -158,7 +158,7 @@ def read_bounded(path: Path, limit: int) -> bytes:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file of bounded size; AgentFileError if it is none."""
+    """Read a JSON file of bounded size; AgentFileError if it is none."""
     content = read_bounded(path, MAX_JSON_BYTES)
     try:
         return json.loads(content)
@@ -191,7 +191,7 @@ def _check(given: Mapping[str, Any], where: Path | str) -> None:
 
 
 def _wrong(kind: Any, value: Any) -> str | None:
-    """What is wrong with a value of this type: the text after "must be"; None if nothing is."""
+    """Describe the right values of this type, the text after "must be"; None if the value is one of them."""
     if kind is str:
         plain = isinstance(value, str) and 0 < len(value) <= MAX_TEXT and value.isprintable() and "|" not in value
         return None if plain else f"printable text of 1 to {MAX_TEXT} characters without |"  # it stands in tables

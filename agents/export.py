@@ -29,7 +29,7 @@ OPSET, IR_VERSION = 17, 9
 
 
 class DeterministicActor(nn.Module):
-    """The deterministic action of a policy, clipped to [-1, 1], for observations as the environment gives them.
+    """Deterministic action of a policy, clipped to [-1, 1], for observations as the environment gives them.
 
     A recurrent policy also takes its state, of length ``memory``, and returns the next one.
     """
@@ -58,7 +58,7 @@ class DeterministicActor(nn.Module):
             self.register_buffer("spread", torch.as_tensor(np.sqrt(rms.var + normalisation.epsilon)).float())
 
     def forward(self, observation: torch.Tensor, *state: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Shape (n, channels) and, with a memory, (n, memory), to the action (n, 2) and the next state."""
+        """Map observations (n, channels), and a memory (n, memory) if there is one, to actions (n, 2) and the next state."""
         x, policy = observation, self.policy
         if self.limit:
             x = torch.clamp((x - self.mean) / self.spread, -self.limit, self.limit)
@@ -83,7 +83,7 @@ def _features(extractor: nn.Module, x: torch.Tensor) -> Any:
 
 
 def lstm_step(x: torch.Tensor, state: torch.Tensor, lstm: nn.LSTM) -> tuple[torch.Tensor, torch.Tensor]:
-    """The hidden values and the next state of an LSTM, whose state is hidden and cell values side by side.
+    """Advance an LSTM by a step: hidden values and the next state, which holds hidden and cell values.
 
     In plain operations: agent files may not have ONNX's LSTM, whose output has a time axis.
     """
@@ -97,7 +97,7 @@ def lstm_step(x: torch.Tensor, state: torch.Tensor, lstm: nn.LSTM) -> tuple[torc
 
 
 def to_onnx(policy: BasePolicy, channels: int, normalisation: VecNormalize | None = None) -> bytes:
-    """The policy as a serialised ONNX model; AgentFileError if it cannot be written as one.
+    """Export a policy as a serialised ONNX model; AgentFileError if that cannot be done.
 
     torch's older exporter: the newer one needs more packages and takes a second.
     """
@@ -132,7 +132,7 @@ def to_onnx(policy: BasePolicy, channels: int, normalisation: VecNormalize | Non
 def to_agent(
     algorithm: BaseAlgorithm, name: str, seed: int, config: Config, normalisation: VecNormalize | None, path: str | Path
 ) -> OnnxPolicy:
-    """The algorithm's policy as an agent called ``name``, not validated yet; ``path`` names it in errors."""
+    """Make an agent called ``name`` of the algorithm's policy, not validated yet; ``path`` names it in errors."""
     policy = algorithm.policy
     content = to_onnx(policy, len(observations(config.process)[config.observation]), normalisation)
     contract = make_contract(

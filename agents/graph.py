@@ -34,7 +34,10 @@ class GraphError(CzError):
 
 
 def check_graph(onnx_bytes: bytes, channels: int) -> tuple[bytes, int]:
-    """The checked graph, rebuilt, and the length of its state (0: none). Raises GraphError, ImportError."""
+    """Check an ONNX file; returns its graph, rebuilt, and the length of its state (0: none).
+
+    Raises GraphError, and ImportError where onnx is not installed.
+    """
     import onnx
     from google.protobuf.message import Error as ProtobufError
 
@@ -72,22 +75,13 @@ def _check_model(model: Any) -> None:
         raise GraphError(
             f"has {len(graph.node)} nodes and {len(graph.initializer)} weights, not 1 to {MAX_NODES} nodes"
         )
-    for node in graph.node:
-        if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
-            name = f"{node.domain}:{node.op_type}" if node.domain else node.op_type
-            raise GraphError(f"uses the operator {name!r:.60}; allowed: {', '.join(OPERATORS)}")
-        if len(node.input) > MAX_NODES or len(node.output) > MAX_NODES:
-            raise GraphError(f"joins more than {MAX_NODES} tensors in one node")
-        for attribute in node.attribute:
-            plain = (attribute.INT, attribute.FLOAT, attribute.INTS, attribute.FLOATS)
-            if attribute.type not in plain or attribute.ref_attr_name:
-                raise GraphError(f"gives {node.op_type} an attribute that is not a number")
 
 
 def _clean(graph: Any, channels: int) -> tuple[Any, int]:
-    """The graph rebuilt from its nodes, weights, inputs and outputs; and its state's length."""
+    """Rebuild the graph from its nodes, weights, inputs and outputs; returns it and its state's length."""
     from onnx import TensorProto, helper, numpy_helper
 
+    nodes = [_node(node) for node in graph.node]
     weights = {tensor.name: _array(tensor) for tensor in graph.initializer}
     uses = [weights[name].size for node in graph.node for name in node.input if name in weights]
     if sum(uses) > MAX_PARAMETERS:
@@ -102,7 +96,6 @@ def _clean(graph: Any, channels: int) -> tuple[Any, int]:
         return [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", w]) for name, w in widths.items()]
 
     inputs, outputs = values(graph.input, INPUTS, (channels, state)), values(graph.output, OUTPUTS, (2, state))
-    nodes = [_node(node) for node in graph.node]
     tensors = [numpy_helper.from_array(array, name) for name, array in weights.items()]
     return helper.make_graph(nodes, "cz_gym_agent", inputs, outputs, tensors), state
 
@@ -130,16 +123,26 @@ def _array(tensor: Any) -> Any:
 
 
 def _node(node: Any) -> Any:
+    """A node rebuilt from its operator, names and numbers; GraphError for one that no agent may have."""
     from onnx import helper
 
-    plain = {attribute.name: helper.get_attribute_value(attribute) for attribute in node.attribute}
-    if len(plain) != len(node.attribute):
+    if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
+        name = f"{node.domain}:{node.op_type}" if node.domain else node.op_type
+        raise GraphError(f"uses the operator {name!r:.60}; allowed: {', '.join(OPERATORS)}")
+    if len(node.input) > MAX_NODES or len(node.output) > MAX_NODES:
+        raise GraphError(f"joins more than {MAX_NODES} tensors in one node")
+    for attribute in node.attribute:
+        plain = (attribute.INT, attribute.FLOAT, attribute.INTS, attribute.FLOATS)
+        if attribute.type not in plain or attribute.ref_attr_name:
+            raise GraphError(f"gives {node.op_type} an attribute that is not a number")
+    numbers = {attribute.name: helper.get_attribute_value(attribute) for attribute in node.attribute}
+    if len(numbers) != len(node.attribute):
         raise GraphError(f"gives {node.op_type} an attribute twice")
-    return helper.make_node(node.op_type, list(node.input), list(node.output), **plain)
+    return helper.make_node(node.op_type, list(node.input), list(node.output), **numbers)
 
 
 def _width(value: Any) -> int:
-    """The width k of a float32 value of shape (n, k) with open n; 0 for any other value."""
+    """Width k of a float32 value of shape (n, k) with open n; 0 for any other value."""
     tensor = value.type.tensor_type
     dims = [*tensor.shape.dim]
     floats = value.type.HasField("tensor_type") and tensor.elem_type == 1
@@ -151,29 +154,37 @@ def _width(value: Any) -> int:
 def _check_shapes(graph: Any) -> None:
     """Refuse a graph whose results have unknown or large shapes, or that may mix the rows of different pullers."""
     shapes = {
-        value.name: value.type.tensor_type.shape.dim for value in (*graph.input, *graph.value_info, *graph.output)
+        value.name: [dim.dim_param or dim.dim_value for dim in value.type.tensor_type.shape.dim]
+        for value in (*graph.input, *graph.value_info, *graph.output)
     }
-    rows = {value.name for value in graph.input}
-    total = 0
+    rows, total = {value.name for value in graph.input}, 0
     for node in graph.node:
         given = [name for name in node.input if name in rows]
-        ranks, per_row = {len(shapes[name]) for name in given}, bool(given)
-        # With other ranks, or on the right of a matrix product, n would meet another axis than its own.
-        product = node.op_type in ("MatMul", "Gemm") and node.input[1] in rows and ranks == {2}
-        axis = next((each.i for each in node.attribute if each.name == "axis"), -1)
-        across = node.op_type == "LayerNormalization" and (axis != -1 or len(node.output) > 1)
-        if len(ranks) > 1 or product or across:
+        if _mixes_rows(node, given, shapes):
             raise GraphError(f"its {node.op_type} may mix the rows of different pullers")
         for name in filter(None, node.output):
-            dims = [dim.dim_param or dim.dim_value for dim in shapes.get(name, ())]
-            widths = dims[1:] if per_row else dims
-            sound = len(dims) <= MAX_RANK and all(isinstance(width, int) and width > 0 for width in widths)
-            if not sound or (per_row and (not dims or dims[0] != "n")):
+            numbers = _numbers(shapes.get(name, []), bool(given))
+            if not numbers:
                 raise GraphError(f"its {node.op_type} does not give each puller a row of known length")
-            total += int(np.prod(widths, dtype=object))
-            if per_row:
-                rows.add(name)
+            total += numbers
+            rows |= {name} if given else set()
     if total > MAX_ACTIVATIONS:
         raise GraphError(f"makes more than {MAX_ACTIVATIONS} numbers for each puller")
     if not {value.name for value in graph.output} <= rows:
         raise GraphError("its outputs do not depend on its inputs")
+
+
+def _numbers(dims: list[Any], per_row: bool) -> int:
+    """Numbers of a result of this shape, of a row where it has rows; 0 for a shape that is not known or not allowed."""
+    widths = dims[1:] if per_row else dims
+    known = len(dims) <= MAX_RANK and all(isinstance(width, int) and width > 0 for width in widths)
+    return int(np.prod(widths, dtype=object)) if known and (not per_row or dims[:1] == ["n"]) else 0
+
+
+def _mixes_rows(node: Any, given: list[str], shapes: dict[str, list[Any]]) -> bool:
+    """Tell a node whose axis of pullers may meet another one; ``given`` are its inputs with such an axis."""
+    ranks = {len(shapes[name]) for name in given}
+    product = node.op_type in ("MatMul", "Gemm") and node.input[1] in given and ranks == {2}
+    axis = next((each.i for each in node.attribute if each.name == "axis"), -1)
+    normalised = node.op_type == "LayerNormalization" and (axis != -1 or len(node.output) > 1)
+    return len(ranks) > 1 or product or normalised

@@ -25,7 +25,7 @@ class OnnxPolicy:
     contract: Contract
     session: Any = field(repr=False, compare=False)
     memory_length: int = 0
-    """Length of its state; 0 if it has none."""
+    """Length of the agent's state; 0 if it has none."""
     content: bytes = field(default=b"", repr=False, compare=False)
     """The ONNX file, so that a policy pickles."""
 
@@ -48,7 +48,7 @@ class OnnxPolicy:
     def of(
         cls, contract: Contract, onnx_bytes: bytes, config: Config | None = None, path: str | Path = "agent"
     ) -> Self:
-        """An agent from its contract and ONNX file; ``path`` names it in errors."""
+        """Make an agent of its contract and ONNX file; ``path`` names it in errors."""
         environment, known = contract.environment, dict[str, Any]()
         if environment in ENVIRONMENTS:
             known = observations(ENVIRONMENTS[environment])
@@ -82,23 +82,23 @@ class OnnxPolicy:
 
     @property
     def observation(self) -> str:
-        """The observation that the agent reads."""
+        """Name of the observation that the agent reads."""
         return self.contract.observation
 
     @property
     def action(self) -> str:
-        """The meaning of its actions, the environment's argument ``action``."""
+        """Meaning of the agent's actions, the environment's argument ``action``."""
         return self.contract.action
 
     @property
     def made_for(self) -> TargetEnv:
-        """The environment it was trained in: meaning of its actions, control interval, plant and puller."""
+        """Environment that the agent was trained in: meaning of actions, control interval, plant and puller."""
         contract = self.contract
         return TargetEnv(self.action, contract.control_interval, contract.plant_hash, contract.puller)
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Its arguments of ``gym.make(contract.environment, ...)``: observation, action and control interval [s]."""
+        """Arguments of ``gym.make(contract.environment, ...)``: observation, action and control interval [s]."""
         return {name: getattr(self.contract, name) for name in ("observation", "action", "control_interval")}
 
     def predict(
@@ -141,7 +141,7 @@ class OnnxPolicy:
 
 
 def _session(path: str | Path, onnx_bytes: bytes, channels: int) -> tuple[Any, int]:
-    """The session that runs the graph, and the length of its state."""
+    """Make the session that runs the graph; returns it and the length of the graph's state."""
     try:
         import onnxruntime
 

@@ -1,4 +1,4 @@
-"""Recipes: every hyperparameter of every learner. A kind of learner is a dataclass, a recipe one value of it.
+"""Recipes of training: every hyperparameter of every learner. A kind of learner is a dataclass, a recipe one value.
 
 A new recipe needs a line in :data:`RECIPES`; a new kind needs a dataclass here and a case in
 :func:`make_algorithm`.
@@ -37,9 +37,9 @@ class TrainingConfig:
     """Hyperparameters of every learner; fields have the names of stable-baselines3's arguments."""
 
     name: str
-    """Name of the agents that it trains."""
+    """Name of the trained agents."""
     steps: int
-    """Environment steps that it learns for, with those of repeated actions."""
+    """Training budget [environment steps]; each repeat of an action counts."""
     num_envs: int
     """Crystals at a time."""
     learning_rate: float
@@ -72,13 +72,13 @@ class TrainingConfig:
         return self.steps // (self.num_envs * self.steps_between)
 
     def with_steps(self, steps: int) -> Self:
-        """The recipe on another budget; on a small one with fewer crystals at a time, so that it still learns."""
+        """Return the recipe with another budget; a small one has fewer crystals at a time, so that it still learns."""
         wanted = round(steps / (self.fewest_updates * self.steps_between))
         return replace(self, steps=steps, num_envs=min(self.num_envs, max(wanted, LEAST_ENVS)))
 
     @property
     def config(self) -> Config:
-        """The environment that the recipe's agents act in."""
+        """Environment that the recipe's agents act in."""
         interval, puller = (None, self.puller) if self.puller else (self.control_interval, None)
         return make_config(
             scenarios(self.scenario), None, self.observation, interval, action=self.action, puller=puller,
@@ -105,7 +105,7 @@ class APG(TrainingConfig):
 
     @property
     def steps_between(self) -> int:
-        """The window."""
+        """Length of the window."""
         return self.window
 
 
@@ -122,7 +122,7 @@ class Reinforcement(TrainingConfig):
     critic_hidden: tuple[int, ...] = (64, 64)
     """Widths of the critic's hidden layers."""
     told: bool = True
-    """Whether the true state is told in training."""
+    """Privileged training: critics read the true state, the actor's estimate is fitted to it."""
     action_repeat: int
     """Environment steps that an action is held for in training: the effect of one of 5 s is lost in the noise."""
     gamma: float = 0.99
@@ -133,11 +133,11 @@ class Reinforcement(TrainingConfig):
 
     @property
     def steps_between(self) -> int:
-        """PPO's rollout."""
+        """Length of PPO's rollout."""
         return self.action_repeat * self.n_steps
 
     def with_steps(self, steps: int) -> Self:
-        """As for every recipe; batches become smaller as the number of crystals does."""
+        """Return the recipe with another budget; batches become smaller as the number of crystals does."""
         fewer = super().with_steps(steps)
         return replace(fewer, batch_size=max(self.batch_size * fewer.num_envs // self.num_envs, LEAST_BATCH))
 
@@ -192,14 +192,14 @@ class SAC(Reinforcement):
 
     @property
     def steps_between(self) -> int:
-        """The steps of an action."""
+        """Steps of an action."""
         return self.action_repeat
 
 
 PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64))
 """stable-baselines3's own PPO, told nothing: beside ``ppo`` it shows what the true state is worth in training."""
 RECIPES: dict[str, TrainingConfig] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG())}
-"""Recipes by name: the choices of ``train.py --algo``."""
+"""Recipes by name: the choices of ``cz-gym train --algo``."""
 _along: dict[str, Any] = {
     "environment": CRYSTAL_ENV,
     "stages": ("crown", "body", "tail"),
@@ -211,14 +211,11 @@ CRYSTAL_RECIPES: dict[str, TrainingConfig] = {
 }
 """Recipes of CzCrystal-v0: one agent for crown, body and tail."""
 DEFAULT_RECIPE = "ppo"
-"""The recipe that train.py follows unless another is named."""
-
-
-# From a recipe to an algorithm with stable-baselines3's interface, on the native batch.
+"""Recipe of ``cz-gym train`` unless another is named."""
 
 
 def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0) -> BaseAlgorithm:
-    """The algorithm of a recipe for a training seed; a resumed one has taken ``done`` steps before."""
+    """Make the algorithm of a recipe for a training seed; a resumed one has taken ``done`` steps before."""
     torch.set_num_threads(1)  # small networks are quicker so
     torch.manual_seed(seed)
     learns = isinstance(recipe, Reinforcement)
@@ -264,5 +261,5 @@ def repeat_of(recipe: TrainingConfig) -> int:
 
 
 def linear_schedule(start: float, left: float) -> float:
-    """A learning rate that falls linearly with the share of training that is left, to a twentieth."""
+    """Learning rate that falls linearly with the share of training that is left, to a twentieth."""
     return start * (0.05 + 0.95 * left)

@@ -5,6 +5,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from cz_gym.agents.recipes import CRYSTAL_ENV, CRYSTAL_RECIPES, DEFAULT_RECIPE, FEW_UPDATES, RECIPES, TrainingConfig
 from cz_gym.agents.train import read_settings
@@ -111,25 +112,27 @@ def _summary_line(summary: dict[str, float]) -> str:
     )
 
 
-def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tuple[TrainingConfig, int]:
-    """TrainingConfig and training seed of the command line, or of the first resumed run; CzError if none may resume."""
+def _saved_settings(resume: bool, folders: list[Path]) -> dict[str, Any]:
+    """Settings of the first run to resume, empty for a new one; CzError if that is the other way round."""
     begun = [folder for folder in folders if (folder / "settings.json").exists()]
-    if begun and not arguments.resume:
+    if begun and not resume:
         raise CzError(f"{begun[0]} holds a run already: --resume it, or name another --out")
-    saved = read_settings((begun or folders)[0] / "settings.json") if arguments.resume else {}
+    return read_settings((begun or folders)[0] / "settings.json") if resume else {}
+
+
+def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tuple[TrainingConfig, int]:
+    """Recipe and training seed of the command line, or of the first resumed run; CzError if none may resume."""
+    saved = _saved_settings(arguments.resume, folders)
     settings, agents = saved.get("settings", {}), saved.get("algorithm", DEFAULT_RECIPE)
     recipes = CRYSTAL_RECIPES if (arguments.env or settings.get("environment")) == CRYSTAL_ENV else RECIPES
     name = arguments.algo or {recipe.name: key for key, recipe in recipes.items()}.get(agents, agents)
     if name not in recipes:
         raise CzError(f"{name!r} is no recipe here: name one of {', '.join(recipes)} by --algo")
-    chosen = {
-        "steps": arguments.steps or saved.get("steps"),
-        "scenario": arguments.scenario or settings.get("scenario"),
-        "puller": arguments.puller or settings.get("puller"),
-    }
-    begun_with = {field: settings[field] for field in ("num_envs", "batch_size") if field in settings}
-    recipe = replace(recipes[name].with_steps(chosen.pop("steps") or recipes[name].steps), **begun_with)
-    recipe = replace(recipe, **{field: value for field, value in chosen.items() if value})
+    chosen = {field: settings[field] for field in ("num_envs", "batch_size", "scenario", "puller") if field in settings}
+    given = {"scenario": arguments.scenario, "puller": arguments.puller}
+    chosen |= {field: value for field, value in given.items() if value}
+    steps = arguments.steps or saved.get("steps") or recipes[name].steps
+    recipe = replace(recipes[name].with_steps(steps), **chosen)
     chosen_puller(recipe.puller or None)
     check_config(recipe.config)
     return recipe, saved.get("seed", 0) if arguments.seed is None else arguments.seed
