@@ -58,7 +58,7 @@ class DeterministicActor(nn.Module):
             self.register_buffer("spread", torch.as_tensor(np.sqrt(rms.var + normalisation.epsilon)).float())
 
     def forward(self, observation: torch.Tensor, *state: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Map observations (n, channels), and a memory (n, memory) if there is one, to actions (n, 2) and the next state."""
+        """Map observations (n, channels), with a memory its state too, to actions (n, 2) and the next state."""
         x, policy = observation, self.policy
         if self.limit:
             x = torch.clamp((x - self.mean) / self.spread, -self.limit, self.limit)
