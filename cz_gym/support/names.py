@@ -32,7 +32,8 @@ def unknown_name_message(kind: str, name: object, known: Iterable[str], also: st
 def check_keywords(given: Iterable[str], *functions: Callable[..., Any]) -> None:
     """Raise UnexpectedKeyword for the first keyword that none of the functions has."""
     parameters = [each for function in functions for each in inspect.signature(function).parameters.values()]
-    known = dict.fromkeys(each.name for each in parameters if each.name != "self" and each.kind != each.VAR_KEYWORD)
+    several = inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD
+    known = dict.fromkeys(each.name for each in parameters if each.name != "self" and each.kind not in several)
     for name in given:
         if name not in known:
             raise UnexpectedKeyword(

@@ -65,6 +65,7 @@ def test_everything_advertised_is_there():
         ({"process": "x"}, "this needs a Process, not 'x': cz_gym.body.process.BODY is one"),
         ({"scenaro": "hard"}, "unexpected keyword argument .scenaro.: did you mean .scenario.[?]"),
         ({"frameskip": 4}, "unexpected keyword argument .frameskip.; choose from scenario"),
+        ({"settings": 4}, "unexpected keyword argument .settings.; choose from scenario, model, .* stage, [^s]"),
         ({"action": "rough"}, "unknown action 'rough'; choose from direct, smooth, rate"),
         ({"info": "everything"}, "info must be one of lean, all, not 'everything'"),
         ({"parameters": Parameters(alpha_0=1.5)}, "nominal meniscus height .* check r_0, alpha_0"),
