@@ -32,7 +32,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import configure_logger
 from tqdm import tqdm
 
-from cz_gym.evaluation.parallel import side_by_side
+from cz_gym.evaluation.parallel import run_parallel
 from cz_gym.sb3 import environment_steps
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import locked, write_files
@@ -435,7 +435,7 @@ def train_seeds(
         else:
             missing.append(run)
     shared = runs[0].folder.parent
-    for number, result in side_by_side(_try_training, missing, poll_progress, cluster, shared):
+    for number, result in run_parallel(_try_training, missing, poll_progress, cluster, shared):
         if isinstance(result, Exception):
             failed[missing[number].seed] = result
         else:

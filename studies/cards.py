@@ -2,16 +2,17 @@
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+
+import pandas as pd
 
 from cz_gym.agents import shipped_names, shipped_seeds
 from cz_gym.agents.contract import Contract, read_agent
-from cz_gym.evaluation.statistics import Estimate
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import check_writable, write_files
-from cz_gym.tools.files import read_results
+from cz_gym.tools.episodes import by_key, read_estimates
 from cz_gym.tools.report.tables import FAILURES, PULL_STEP, RMSE, Column
 from cz_gym.tools.report.tables import markdown as table
 
@@ -35,16 +36,16 @@ FIGURES = (
 """Columns of a card."""
 RETURN = "return"
 """Metric that model hubs show as the mean reward."""
-Results = Mapping[str, Mapping[str, Mapping[str, Estimate]]]
-"""Estimates of the benchmark by scenario, controller and metric."""
 
 
-def card(name: str, how: str, contracts: Sequence[Contract], results: Results) -> str:
+def card(name: str, how: str, contracts: Sequence[Contract], estimates: pd.DataFrame) -> str:
     """An agent's section."""
     first, taken = contracts[0], sorted(contract.training_steps / 1e6 for contract in contracts)
     steps = " to ".join(dict.fromkeys(f"{each:.0f}" for each in (taken[0], taken[-1])))
-    rows = [[where, *(column.text(of[name][column.metric]) for column in FIGURES)] for where, of in results.items()]
-    fails = [f"`{scenario}`" for scenario, of in results.items() if of[name]["failure_rate"].mean > 0.0]
+    known, scenarios = by_key(estimates), estimates["scenario"].unique()
+    rows = [[where, *(column.text(known[where, name, column.metric, "mean"]) for column in FIGURES)]
+            for where in scenarios]  # fmt: skip
+    fails = [f"`{where}`" for where in scenarios if known[where, name, FAILURES.metric, "mean"].mean > 0.0]
     return "\n".join(
         [
             f"## `{name}`\n",
@@ -68,13 +69,13 @@ No agent was trained or tested on a real puller: none may control one.
 """
 
 
-def hub_page(name: str, text: str, results: Results) -> str:
+def hub_page(name: str, text: str, estimates: pd.DataFrame) -> str:
     """A card as a model hub reads it: metadata in YAML, with the mean return of each scenario, then the text."""
     metrics = [
         f"  - task: {{type: reinforcement-learning, name: reinforcement-learning}}\n"
-        f"    dataset: {{name: Cz-v0 {scenario}, type: Cz-v0}}\n"
-        f"    metrics: [{{type: mean_reward, value: {of[name][RETURN].mean:.1f}, name: mean_reward}}]"
-        for scenario, of in results.items()
+        f"    dataset: {{name: Cz-v0 {row.scenario}, type: Cz-v0}}\n"
+        f"    metrics: [{{type: mean_reward, value: {row.mean:.1f}, name: mean_reward}}]"
+        for row in estimates.query("controller == @name and metric == @RETURN").itertuples()
     ]
     head = ["library_name: cz-gym", "license: mit", "tags: [Cz-v0, reinforcement-learning, control]", "model-index:"]
     head += [f"- name: {name}", "  results:", *metrics]
@@ -95,12 +96,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> None:
     check_writable(given.out.parent)
-    results, _ = read_results(given.benchmark, [*(column.metric for column in FIGURES), RETURN])
+    estimates, _ = read_estimates(given.benchmark, [*(column.metric for column in FIGURES), RETURN])
     shipped = {name: how for name, how in AGENTS.items() if name in shipped_names()}
-    if not all(shipped.keys() <= by_name.keys() for by_name in results.values()):
+    if estimates.empty or any(shipped.keys() - set(own["controller"]) for _, own in estimates.groupby("scenario")):
         raise CzError(f"{given.benchmark}: no results of {', '.join(shipped)}")
     cards = {
-        name: card(name, of, [read_agent(each)[0] for each in shipped_seeds(name)], results)
+        name: card(name, of, [read_agent(each)[0] for each in shipped_seeds(name)], estimates)
         for name, of in shipped.items()
     }
     write_files({given.out: "\n".join([ABOUT, *cards.values()]).encode()})
@@ -108,7 +109,7 @@ def _main(given: argparse.Namespace) -> None:
     for name, text in cards.items() if given.hub else ():
         files = [path for file in shipped_seeds(name) for path in (file, file.with_suffix(".json"))]
         content = {given.hub / name / path.name: path.read_bytes() for path in files}
-        write_files({**content, given.hub / name / "README.md": hub_page(name, text, results).encode()})
+        write_files({**content, given.hub / name / "README.md": hub_page(name, text, estimates).encode()})
         print(f"wrote {given.hub / name}")
 
 

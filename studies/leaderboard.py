@@ -23,18 +23,18 @@ from cz_gym.evaluation.protocol import (
     Case,
     Contender,
     agent,
-    contract_hash,
 )
-from cz_gym.evaluation.results import Result
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import check_writable, name_file_in_errors, write_files
-from cz_gym.tools.files import read_results, to_json
+from cz_gym.tools.episodes import Benchmark, by_key, read_estimates
+from cz_gym.tools.files import to_json
 from cz_gym.tools.registry import CONTROLLERS
 from cz_gym.tools.report.markdown import summary
 from cz_gym.tools.report.tables import RMSE
 from cz_gym.tools.report.tables import markdown as table
 from cz_gym.tools.run import check_agents, run
+from cz_gym.tools.task_records import contract_hash
 
 FRESH = range(3_000_000, 2**31)
 """Seeds that no training, validation or test uses."""
@@ -67,36 +67,38 @@ def submission(folder: Path) -> tuple[Contender, tuple[float, str]]:
     if not files:
         raise CzError(f"{folder}: no agent file (*.onnx)")
     claimed = folder / "benchmark.json"
-    results, contract = read_results(claimed, ["rmse_mm"])
-    if folder.name not in results.get(CASES[0].name, {}):
+    estimates, contract = read_estimates(claimed, [RMSE.metric])
+    claim = by_key(estimates).get((CASES[0].name, folder.name, RMSE.metric, "mean"))
+    if claim is None:
         raise CzError(f"{claimed}: no results of {folder.name!r} on {CASES[0].name}")
     contender = agent(folder.name, [OnnxPolicy.load(file) for file in files], own=True)
-    return contender, (results[CASES[0].name][folder.name]["rmse_mm"].mean, contract)
+    return contender, (claim.mean, contract)
 
 
-def page(results: Sequence[Result], claims: Claims, cases: Sequence[Case]) -> str:
+def page(benchmark: Benchmark, claims: Claims) -> str:
     """The leaderboard in Markdown: of each budget its agents by their mean RMSE here; losses and claims beside it."""
-    here = {sample.name: sample.contender for sample in results[0].samples if sample.name in claims}
+    here, cases = {each.name: each for each in benchmark.contenders if each.name in claims}, benchmark.cases
+    crystals = benchmark.seeds(cases[0])
 
     def mean(name: str, metric: str) -> float:
-        return sum(result.means[name][metric].mean for result in results) / len(results)
+        return sum(benchmark.mean(case, name, metric) for case in cases) / len(cases)
 
     lines, places, order = [], Counter[str](), [*BUDGETS, "open"]
     for name in sorted(here, key=lambda name: (order.index(budget(here[name])), mean(name, "rmse_mm"))):
         spent, told = budget(here[name]), TOLD[here[name].knows]
         places[spent] += 1
         claim, contract = claims[name]
-        own = RMSE.text(results[0].means[name][RMSE.metric])
+        own = RMSE.of(benchmark, cases[0], name)
         same = "the same" if contract == contract_hash(cases) else f"other: `{contract or 'unknown'}`"
         seeds, lost = str(len(here[name].training_seeds)), f"{100.0 * mean(name, 'failure_rate'):.2f}"
         lines.append((spent, str(places[spent]), name, told, seeds, f"{claim:.3f}", own, lost, same))
-    seeds = f"{cases[0].first_seed} to {results[0].seeds[-1]}"
+    seeds = f"{crystals[0]} to {crystals[-1]}"
     about = (
-        f"Submitted agents on {len(results[0].seeds)} fresh crystals of each scenario (seeds {seeds}), by mean RMSE. "
+        f"Submitted agents on {len(crystals)} fresh crystals of each scenario (seeds {seeds}), by mean RMSE. "
         f'"Claimed" and "here" are the RMSE on {cases[0].name}, from the submission and from these crystals.'
     )
     beside = "Every scenario, beside classical controllers:"
-    return "\n\n".join(["# Leaderboard", about, table(HEADS, lines), beside, summary(results)]) + "\n"
+    return "\n\n".join(["# Leaderboard", about, table(HEADS, lines), beside, summary(benchmark)]) + "\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -123,10 +125,10 @@ def _main(given: argparse.Namespace) -> None:
     agents = [contender for contender, _ in submitted]
     check_agents(agents, cases)
     contenders = [*(each for each in CONTROLLERS if each.quoted), *agents]
-    results = run(contenders, cases, given.episodes, given.out)
-    text = page(results, {contender.name: claim for contender, claim in submitted}, cases)
+    benchmark = run(contenders, cases, given.episodes, given.out)
+    text = page(benchmark, {contender.name: claim for contender, claim in submitted})
     command = f"python -m studies.leaderboard {given.folder} --episodes {given.episodes} --first-seed {first}"
-    files = {"leaderboard.md": text, "leaderboard.json": to_json(results, command)}
+    files = {"leaderboard.md": text, "leaderboard.json": to_json(benchmark, command)}
     write_files({given.out / name: content.encode() for name, content in files.items()})
     print(text)
 

@@ -7,9 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.body.signals import COST_CAP, PULL_TOLERANCE, TOLERANCE, moved_mean
-from cz_gym.crystal.process import CRYSTAL
 from cz_gym.crystal.recipe import CONE_LIMIT, FAILURE_MODES, relative_margin
-from cz_gym.process import Process
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from .rollout import Rollout
@@ -18,6 +16,9 @@ Floats = npt.NDArray[np.float64]
 PULL_WINDOW = 30.0 * MINUTE
 """Length of the running mean of the pull speed, on which v/G depends [s]."""
 
+SPEED, OUTSIDE = "microseconds_per_step", "outside_tolerance"
+"""Names of two figures of an episode besides its metrics: the time in ``predict`` per step and episode, batched [us];
+the share of time outside a tolerance of the radius error [-]."""
 ALMOST = 1.0 - 1e-6
 """Share of a limit that counts as the limit itself [-]."""
 
@@ -69,11 +70,6 @@ class Metrics(NamedTuple):
 def names_of(kind: Any) -> tuple[str, ...]:
     """Return the names of metrics, a type with a field each, as files and tables have them."""
     return tuple(name.rstrip("_") for name in kind._fields)
-
-
-def metric_names() -> tuple[str, ...]:
-    """Return the names of ``Cz-v0``'s metrics."""
-    return names_of(Metrics)
 
 
 def metrics(run: Rollout) -> Metrics:
@@ -263,16 +259,6 @@ def crystal_metrics(run: Rollout) -> CrystalMetrics:
         **{f"lost_in_{part}": (lost_in == number).astype(np.float64) for number, part in enumerate(PARTS)},
         **{way: (how == number).astype(np.float64) for number, way in enumerate(FAILURE_MODES)},
     )
-
-
-def kind_of(process: Process) -> Any:
-    """The type of a process' metrics."""
-    return CrystalMetrics if process == CRYSTAL else Metrics
-
-
-def measured(run: Rollout) -> Any:
-    """The metrics of a rollout, of the type of its process."""
-    return crystal_metrics(run) if run.config.process == CRYSTAL else metrics(run)
 
 
 def _mean(values: Floats, dt: float) -> Floats:

@@ -23,7 +23,7 @@ WAIT = 1.0
 Look = Callable[[], None]
 
 
-def through(
+def run_tasks(
     executor: Executor, function: Callable[[Any], Any], tasks: Sequence[Any], look: Look | None = None
 ) -> Iterator[tuple[int, Any]]:
     """Run ``function`` on every task by an executor; yields the number of a task and its result, as they come.
@@ -42,14 +42,14 @@ def through(
 def in_processes(
     function: Callable[[Any], Any], tasks: Sequence[Any], look: Look | None = None, processes: int | None = None
 ) -> Iterator[tuple[int, Any]]:
-    """Run tasks as :func:`through` does, in a pool of processes (None: one a processor) that ends with its caller."""
+    """Run tasks as :func:`run_tasks` does, in a pool of processes (None: one a processor) that ends with its caller."""
     # Forking would copy the threads of torch and of the native batch in unknown states.
     context = get_context("spawn")
-    leash, held = context.Pipe(duplex=False)
+    parent_pipe, held = context.Pipe(duplex=False)
     workers = max(min(processes or processors(), len(tasks)), 1)
-    pool = ProcessPoolExecutor(workers, context, initializer=_end_with, initargs=(leash,))
+    pool = ProcessPoolExecutor(workers, context, initializer=_end_with, initargs=(parent_pipe,))
     try:
-        yield from through(pool, function, tasks, look)
+        yield from run_tasks(pool, function, tasks, look)
         pool.shutdown()
     except BrokenProcessPool:
         raise CzError("a process was killed: is there enough memory?") from None
@@ -58,7 +58,7 @@ def in_processes(
         pool.shutdown(cancel_futures=True)
 
 
-def side_by_side(
+def run_parallel(
     function: Callable[[Any], Any],
     tasks: Sequence[Any],
     look: Look | None = None,
@@ -66,7 +66,7 @@ def side_by_side(
     shared: Path | None = None,
     processes: int | None = None,
 ) -> Iterator[tuple[int, Any]]:
-    """Run tasks as :func:`through` does, on the cluster at that address, or in processes of this machine.
+    """Run tasks as :func:`run_tasks` does, on the cluster at that address, or in processes of this machine.
 
     ``shared`` is the folder that tasks write into.
     """
@@ -88,13 +88,13 @@ def _uninterrupted() -> Iterator[None]:
         mask(getattr(signal, "SIG_SETMASK", 0), before)
 
 
-def _end_with(leash: Any) -> None:
+def _end_with(parent_pipe: Any) -> None:
     """In a process of a pool: leave Ctrl-C to the caller, and end when the other end of the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def follow() -> None:
         try:
-            leash.recv()
+            parent_pipe.recv()
         except EOFError:
             os._exit(1)
 
@@ -139,7 +139,7 @@ def check_versions(where: str, own: Versions, asked: Versions) -> None:
 def on_cluster(
     address: str, function: Callable[[Any], Any], tasks: Any, look: Any = None, shared: Path | None = None
 ) -> Iterator[tuple[int, Any]]:
-    """Run tasks as :func:`.processes.through` does, on the workers of the scheduler at ``address``, tcp://HOST:8786.
+    """Run tasks as :func:`run_tasks` does, on the workers of the scheduler at ``address``, tcp://HOST:8786.
 
     Every worker must have the same versions, one thread, and see the folder ``shared``; CzError otherwise. The task of
     a worker that dies is run again by another one; tasks that are left are cancelled when the caller stops.
@@ -149,7 +149,7 @@ def on_cluster(
         _check_workers(client, shared)
         executor = client.get_executor(pure=False)
         try:
-            yield from through(executor, OnWorker(function), tasks, look)
+            yield from run_tasks(executor, OnWorker(function), tasks, look)
         except distributed.scheduler.KilledWorker:
             raise CzError("a task has ended one worker after the other: is there enough memory?") from None
         finally:

@@ -3,7 +3,6 @@
 import io
 from collections.abc import Callable, Sequence
 from itertools import cycle
-from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ from PIL import Image
 from cz_gym.body.signals import Logged
 from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
-from .results import REFERENCE, Result, Sample
+from .protocol import Contender
 from .rollout import Floats
 
 COLOURS = (
@@ -50,28 +49,9 @@ def styles(names: Sequence[str]) -> dict[str, Style]:
     return {name: Style(*style) for name, style in zip(dict.fromkeys(names), turns, strict=False)}
 
 
-def styles_of(samples: Sequence[Sample]) -> dict[str, Style]:
+def styles_of(contenders: Sequence[Contender]) -> dict[str, Style]:
     """Return one style a contender: the user's own come first, then the quoted, agents, and the others."""
-    contenders = [sample.contender for sample in samples]
     return styles([each.name for each in sorted(contenders, key=lambda c: (not c.own, not c.quoted, not c.learned))])
-
-
-def chosen(samples: Sequence[Sample], most: int) -> list[Sample]:
-    """Return at most ``most`` of the samples, in their order, for a figure that has no room for all.
-
-    Preferred are the reference, the user's own, the best agent, quoted controllers, other agents, other controllers,
-    bounds; within a group those of a lower mean RMSE.
-    """
-    ranked = sorted(samples, key=lambda sample: float(sample.metric("rmse_mm").mean()))
-    learned = [sample.name for sample in ranked if sample.contender.learned and not sample.contender.bound]
-
-    def place(sample: Sample) -> tuple[bool, ...]:
-        who = sample.contender
-        first = who.name != REFERENCE, not who.own, who.name not in learned[:1], not who.quoted
-        return *first, who.bound, not who.learned
-
-    names = [sample.name for sample in sorted(ranked, key=place)[:most]]
-    return [sample for sample in samples if sample.name in names]
 
 
 def canvas(width: float, height: float) -> Figure:
@@ -106,13 +86,6 @@ ROOM = (0.01 * MM, 3.0 * MM)
 """Smallest and largest margin of the radius axis around the reference [m]."""
 SMOOTH = 5.0 * MINUTE
 """Length of the running mean of the drives [s], drawn over their single steps."""
-
-
-def example(sample: Sample) -> Any:
-    """Return the signals of a sample's first crystal, which every sample of a run has."""
-    if sample.example is None:
-        raise ValueError(f"the sample of {sample.name} has no signals")
-    return sample.example
 
 
 class _Panel(NamedTuple):
@@ -166,19 +139,6 @@ def draw(crystals: Sequence[DrawnCrystal], dt: float, title: str, tolerance: flo
     return figure
 
 
-def crystal(result: Result) -> bytes:
-    """Draw the first crystal of a scenario under the controllers of :func:`.chosen`."""
-    samples, style = chosen(result.samples, COLUMNS), styles_of(result.samples)
-    crystals = []
-    for sample in samples:
-        rmse = f"RMSE {sample.metric('rmse_mm')[0, 0]:.3g} mm"
-        crystals.append(
-            DrawnCrystal(f"{fill(sample.name, 18)}\n{rmse}", example(sample), style[sample.name].colour, lost(sample))
-        )
-    title = f"One crystal of {result.case.name} (test seed {samples[0].seeds[0]:,})"
-    return png(draw(crystals, result.case.control_interval, title, result.case.tolerance or 0.0))
-
-
 def _draw(axes: Any, crystal: DrawnCrystal, dt: float, reference: Floats) -> None:
     signals, colour = crystal.signals, crystal.colour
     minutes = _minutes(len(signals.r_c), dt)
@@ -195,11 +155,6 @@ def _draw(axes: Any, crystal: DrawnCrystal, dt: float, reference: Floats) -> Non
             axis.axvline(minutes[-1], color=INK, lw=0.8, ls=":")
     axes[0].set_title(crystal.title + ", lost" * crystal.lost, fontsize=9, color=INK, fontweight="bold")
     axes[-1].set_xlabel("time [min]")
-
-
-def lost(sample: Sample) -> bool:
-    """Return whether the first crystal was lost, with the first training seed."""
-    return bool(sample.metric("failure_rate")[0, 0])
 
 
 def _set_limits(axes: Any, crystals: Sequence[DrawnCrystal], longest: Logged, dt: float) -> None:

@@ -1,13 +1,11 @@
 """Contenders: controllers and agents by name, and functions that build them."""
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from cz_gym.body.process import BODY
-from cz_gym.body.signals import PULL_TOLERANCE, TOLERANCE
 from cz_gym.config import Config, make_config
 from cz_gym.crystal.plant import STAGES
 from cz_gym.crystal.process import CRYSTAL
@@ -30,6 +28,12 @@ GROUPS = {
     PLANT: "learned, plant known in training",
 }
 """Table headings of agents by source, the least information first."""
+
+
+REFERENCE = "paper"
+"""Controller that paired differences are taken against."""
+BOUND = "clairvoyant"
+"""Controller that optimality gaps are measured from."""
 
 
 @dataclass(frozen=True)
@@ -259,8 +263,6 @@ CRYSTAL_CASES: tuple[Case, ...] = tuple(
     for stage in STAGES
 )
 """Every case of ``CzCrystal-v0``: a stage under a scenario's disturbances; on randomized it has the stage's name."""
-ENVIRONMENTS: dict[str, tuple[Case, ...]] = {"Cz-v0": CASES, "CzCrystal-v0": CRYSTAL_CASES}
-"""The cases of each environment."""
 
 
 def find_case(name: str, cases: Sequence[Case] = CASES) -> Case:
@@ -269,14 +271,3 @@ def find_case(name: str, cases: Sequence[Case] = CASES) -> Case:
         if case.name == ALIASES.get(name, name):
             return case
     raise CzError(unknown_name_message("scenario", name, [case.name for case in cases]))
-
-
-def contract_hash(cases: Sequence[Case]) -> str:
-    """The hash of what figures rest on: plant, scenarios, interval, horizon of the random cases; reward and metrics."""
-    from .metrics import ALMOST, PULL_WINDOW, kind_of, names_of
-
-    random = [case.config() for case in cases if not case.deterministic]
-    configs = random or [case.config() for case in cases]
-    parts = [*sorted(config.hash for config in configs), configs[0].reward_hash, *names_of(kind_of(cases[0].process))]
-    parts += [str(number) for number in (PULL_WINDOW, PULL_TOLERANCE, TOLERANCE, ALMOST)]
-    return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:12]

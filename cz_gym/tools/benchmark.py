@@ -7,9 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from cz_gym.agents import OnnxPolicy, shipped_names, shipped_seeds
-from cz_gym.crystal.process import CRYSTAL
 from cz_gym.evaluation import user_code
-from cz_gym.evaluation.protocol import CRYSTAL_CASES, ENVIRONMENTS, SLOW_EPISODES, Case, Contender, agent, find_case
+from cz_gym.evaluation.protocol import SLOW_EPISODES, Case, Contender, agent, find_case
 from cz_gym.puller.file import chosen_puller
 from cz_gym.support.command_line import OneLineParser, between, relative_path, run_command
 from cz_gym.support.errors import CzError
@@ -18,15 +17,12 @@ from cz_gym.support.units import MM
 from cz_gym.tools.report.markdown import terminal
 
 from .files import check_targets, write
-from .registry import TASKS
 from .run import check_agents, is_cached, run
+from .task_records import TASKS
 
 CLONE = Path(__file__).resolve().parents[2]
 RESULTS = CLONE / "results" if (CLONE / "results" / "benchmark").is_dir() else Path("runs")
 """Folder of the committed results in a clone, of a user's results elsewhere."""
-FOLDER = RESULTS / "benchmark"
-CRYSTALS = RESULTS / "crystal"
-"""The same of whole crystals."""
 README, CRYSTAL_PAGE = CLONE / "README.md", CLONE / "docs" / "crystal.md"
 """Pages of a clone that quote the committed results between two markers."""
 OWN = Path("runs")
@@ -48,7 +44,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     )
     add = parser.add_argument
     about = "environment (%(default)s); of a whole crystal the scenarios are its stages"
-    add("--env", choices=ENVIRONMENTS, default="Cz-v0", help=about)
+    add("--env", choices=TASKS, default="Cz-v0", help=about)
     about = "first N test episodes (%(default)s)"
     add("--episodes", type=between(1, EPISODES), default=EPISODES, metavar="N", help=about)
     add("--controllers", type=_names, metavar="A,B", help='controllers and agents by name, or "all"')
@@ -57,7 +53,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         "--out",
         type=Path,
         metavar="DIR",
-        help=f"folder for the results ({relative_path(FOLDER)}; of your own: runs/NAME)",
+        help=f"folder for the results ({relative_path(RESULTS / 'benchmark')}; of your own: runs/NAME)",
     )
     add("--json", type=Path, metavar="FILE", help="write benchmark.json to FILE, and only that unless --out is given")
     agent_help = (
@@ -109,26 +105,25 @@ def main(argv: Sequence[str]) -> int:
 
 def folder_of(arguments: argparse.Namespace) -> Path:
     """Folder of the committed results of an environment."""
-    return CRYSTALS if arguments.env == "CzCrystal-v0" else FOLDER
+    return RESULTS / TASKS[arguments.env].name
 
 
 def benchmark(arguments: argparse.Namespace, command: str) -> int:
     """Check the arguments, run the benchmark, write and print the results."""
-    cases = cases_of(arguments)
+    task, cases = TASKS[arguments.env], cases_of(arguments)
     contenders = contenders_of(arguments, cases)
     smaller = is_partial(arguments, contenders, cases)
     check_targets(arguments.out, arguments.json, smaller, arguments.overwrite)
     if arguments.out is not None:  # a missing package is named before the work, not after it
         import matplotlib  # noqa: F401
         import plotly  # noqa: F401
-    bounds = None if arguments.puller or cases[0].process == CRYSTAL else BOUNDS
-    results = run(contenders, cases, arguments.episodes, CACHE, bounds, arguments.quiet, arguments.cluster)
+    bounds = BOUNDS if task.has_bound and not arguments.puller else None
+    found = run(contenders, cases, arguments.episodes, CACHE, bounds, arguments.quiet, arguments.cluster)
     renewed = not smaller and arguments.out and arguments.out.resolve() == folder_of(arguments)
-    quoted = (README, CRYSTAL_PAGE) if renewed else ()
-    write(arguments.out, arguments.json, results, command, quoted)
+    write(arguments.out, arguments.json, found, command, (README, CRYSTAL_PAGE) if renewed else ())
     if not arguments.quiet:
-        print(terminal(results))
-        slow = {each.name for each in TASKS[arguments.env].known if each.slow} - {each.name for each in contenders}
+        print(terminal(found))
+        slow = {each.name for each in task.controllers() if each.slow} - {each.name for each in contenders}
         if arguments.controllers == ["all"] and slow:
             names = ", ".join(sorted(slow))
             print(f"left out of all: {names}, which are slow and not cached for every episode; add --slow to run them")
@@ -139,16 +134,16 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
 
 def cases_of(arguments: argparse.Namespace) -> list[Case]:
     """Scenarios that the command line asks for, as cases of the protocol."""
-    known = ENVIRONMENTS[arguments.env]
-    graded = arguments.puller and known is not CRYSTAL_CASES
+    task = TASKS[arguments.env]
+    graded = arguments.puller and task.graded
     if arguments.tolerance is not None and not (graded and 0.0 < arguments.tolerance <= 50.0):
         raise CzError(f"--tolerance {arguments.tolerance:g} must be up to 50 mm, beside --puller FILE.toml, of Cz-v0")
-    names = arguments.scenarios or [case.name for case in known if case.default and not arguments.scenario]
-    cases = [*(find_case(name, known) for name in names), *map(user_code.case, arguments.scenario)]
+    names = arguments.scenarios or [case.name for case in task.cases if case.default and not arguments.scenario]
+    cases = [*(find_case(name, task.cases) for name in names), *map(user_code.case, arguments.scenario)]
     user_code.check_apart([case.name for case in cases], "scenario")
     puller = chosen_puller(arguments.puller)
     tolerance = 0.5 * MM * (arguments.tolerance or 1.0) if graded else None
-    return [replace(case, puller=puller, tolerance=tolerance, process=known[0].process) for case in cases]
+    return [replace(case, puller=puller, tolerance=tolerance, process=task.cases[0].process) for case in cases]
 
 
 def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[Contender]:
@@ -158,7 +153,7 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
     ``--slow`` asks for them, or if they are named and all their episodes cached.
     """
     own, given = [user_code.controller(place) for place in arguments.controller], given_agents(arguments)
-    controllers, shipped = TASKS[arguments.env].known, shipped_names(arguments.env)
+    controllers, shipped = TASKS[arguments.env].controllers(), shipped_names(arguments.env)
     names = [each.name for each in controllers]
     new = [name for name in given if name not in shipped]
     user_code.check_apart([*names, *shipped, *new, *(each.name for each in own)], "controller")
@@ -166,16 +161,11 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
     def may_run(each: Contender) -> bool:
         return not each.slow or arguments.slow or is_cached(each, cases, arguments.episodes, CACHE)
 
-    wanted, agents = arguments.controllers, list(given) or ([] if arguments.puller else shipped)
-    if not wanted and arguments.puller:
-        wanted = [each.name for each in controllers if each.on_puller] + agents
-    elif not wanted and own and not arguments.slow:
-        wanted = [each.name for each in controllers if each.quoted]
-    elif not wanted:
-        usual = [each for each in controllers if (arguments.slow if each.slow else each.default)]
-        wanted = [each.name for each in usual] + agents
-    elif wanted == ["all"]:
+    agents = list(given) or ([] if arguments.puller else shipped)
+    if arguments.controllers == ["all"]:
         wanted = [each.name for each in controllers if may_run(each)] + agents
+    else:
+        wanted = arguments.controllers or default_names(arguments, controllers, agents)
     for name in wanted:
         if name not in (known := [*names, *new, *shipped]):
             raise CzError(unknown_name_message("controller", name, known, ", or all"))
@@ -191,6 +181,16 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
     return [*chosen, *own]
 
 
+def default_names(arguments: argparse.Namespace, controllers: Sequence[Contender], agents: Sequence[str]) -> list[str]:
+    """Names of the controllers and agents of a run that names none: fewer on a puller, or beside the user's own."""
+    if arguments.puller:
+        return [*(each.name for each in controllers if each.on_puller), *agents]
+    if arguments.controller and not arguments.slow:
+        return [each.name for each in controllers if each.quoted]
+    usual = [each.name for each in controllers if (arguments.slow if each.slow else each.default)]
+    return [*usual, *agents]
+
+
 def given_agents(arguments: argparse.Namespace) -> dict[str, Contender]:
     """Agents of files by name: the files of one name are its training seeds."""
     policies: dict[str, list[OnnxPolicy]] = {}
@@ -204,9 +204,9 @@ def given_agents(arguments: argparse.Namespace) -> dict[str, Contender]:
 
 def is_partial(arguments: argparse.Namespace, contenders: Sequence[Contender], cases: Sequence[Case]) -> bool:
     """Whether the run holds less than the default one, or something of the user's own."""
-    usual = {each.name for each in TASKS[arguments.env].known if each.default and not each.slow}
+    usual = {each.name for each in TASKS[arguments.env].controllers() if each.default and not each.slow}
     usual |= set(shipped_names(arguments.env))
-    usual_cases = {case for case in ENVIRONMENTS[arguments.env] if case.default}
+    usual_cases = {case for case in TASKS[arguments.env].cases if case.default}
     missing = usual - {each.name for each in contenders} or usual_cases - set(cases)
     own = arguments.agent or arguments.controller or arguments.scenario or arguments.puller
     return bool(arguments.episodes < EPISODES or missing or own)

@@ -30,7 +30,7 @@ import cz_gym
 from cz_gym import agents
 from cz_gym.config import Config, check_config, make_config
 from cz_gym.env import CzVectorEnv
-from cz_gym.evaluation.parallel import side_by_side
+from cz_gym.evaluation.parallel import run_parallel
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import informed, rollout
 from cz_gym.puller.file import DEFAULT, PullerFile, chosen_puller, to_toml
@@ -285,7 +285,7 @@ def _write_all(given: argparse.Namespace) -> None:
         for name in given.policies.split(",")
     ]
     one = partial(_write_one, datasets_root().absolute(), TRAINING_SEEDS[: given.episodes], given.noise, settings)
-    on_cluster = side_by_side(one, tasks, None, given.cluster, datasets_root().absolute())
+    on_cluster = run_parallel(one, tasks, None, given.cluster, datasets_root().absolute())
     for _, line in on_cluster if given.cluster else enumerate(map(one, tasks)):
         print(line, flush=True)
 

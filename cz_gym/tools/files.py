@@ -1,33 +1,29 @@
-"""A benchmark's results as files: JSON and CSV, written with the report, and read back."""
+"""A benchmark's results as files: JSON, the table of episodes, and the report."""
 
-import csv
-import io
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from cz_gym.evaluation.protocol import contract_hash
-from cz_gym.evaluation.results import BOUND, REFERENCE, Result
+from cz_gym.evaluation.metrics import OUTSIDE
+from cz_gym.evaluation.protocol import BOUND, REFERENCE, Case
 from cz_gym.evaluation.statistics import RESAMPLES, SEED, Estimate
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import check_writable, name_file_in_errors, write_files
 from cz_gym.support.names import software
 
+from .episodes import Benchmark, to_csv
+from .task_records import contract_hash
+
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime")
 """Packages whose versions are recorded."""
 FACTS = ("name", "observation", "meaning", "training_seeds", "privileged", "slow", "action", "own")
-"""What is recorded of a contender."""
+"""Fields of a contender that are recorded."""
 RESULTS, EPISODES = "benchmark.json", "episodes.csv"
 FILES = (RESULTS, EPISODES, "report.md", "report.html", "crystal.png", "pareto.png")
 """Everything a folder of results may hold."""
-Episodes = dict[str, dict[str, npt.NDArray[np.float64]]]
-"""By scenario and controller: metrics of shape (training seeds, crystals, metrics)."""
 
 
 def check_targets(folder: Path | None, lone: Path | None, partial: bool, overwrite: bool) -> None:
@@ -48,89 +44,90 @@ def check_targets(folder: Path | None, lone: Path | None, partial: bool, overwri
 
 
 def write(
-    folder: Path | None, lone: Path | None, results: Sequence[Result], command: str, quoted: Sequence[Path] = ()
+    folder: Path | None, lone: Path | None, benchmark: Benchmark, command: str, quoted: Sequence[Path] = ()
 ) -> None:
     """Write the files, ``benchmark.json`` last, and the table into the pages ``quoted`` that exist."""
-    text = to_json(results, command).encode()
+    text = to_json(benchmark, command).encode()
     files: dict[Path, bytes] = {}
     if folder:
         from cz_gym.tools.report.figures import draw_figures
         from cz_gym.tools.report.markdown import fill_in, markdown
         from cz_gym.tools.report.page import page
 
-        figures = draw_figures(results)
+        figures = draw_figures(benchmark)
         files |= {folder / name: image for name, image in figures.items()}
-        files[folder / EPISODES] = to_csv(results).encode()
-        files[folder / "report.md"] = markdown(results, command, figures).encode()
-        files[folder / "report.html"] = page(results, command).encode()
+        files[folder / EPISODES] = to_csv(benchmark.episodes)
+        files[folder / "report.md"] = markdown(benchmark, command, figures).encode()
+        files[folder / "report.html"] = page(benchmark, command).encode()
         for each in filter(Path.is_file, quoted):
             with name_file_in_errors(each):
                 before = each.read_text("utf-8")
-            files[each] = fill_in(before, results).encode()
+            files[each] = fill_in(before, benchmark).encode()
         files[folder / RESULTS] = text
     if lone:
         files[lone] = text
     write_files(files)
 
 
-def to_json(results: Sequence[Result], command: str) -> str:
+def to_json(benchmark: Benchmark, command: str) -> str:
     """Return the text of ``benchmark.json``: results, paired differences, tails, verdicts and provenance."""
-
-    def each(table: Callable[[Result], Mapping[str, Any]]) -> dict[str, Any]:
-        return {result.case.name: _plain(table(result)) for result in results}
-
+    means, largest = _nested(benchmark, "mean"), _nested(benchmark, "quantile")
+    paired, improvement = _nested(benchmark, "difference"), _nested(benchmark, "improvement")
+    for case, of in improvement.items():
+        for name, each in of.items():
+            paired[case][name]["rmse_mm"]["probability_of_improvement"] = each["rmse_mm"]
+    gaps = {
+        metric: {
+            case: {name: found[metric] for name, found in of.items() if metric in found}
+            for case, of in _nested(benchmark, "gap").items()
+        }
+        for metric in ("cost", "rmse_mm")
+    }
     data = {
-        "results": each(lambda result: result.means),
-        "paired": each(_paired),
-        "cvar5": each(lambda result: result.cvar5),
-        "largest": each(lambda result: result.largest),
-        "optimality_gap": _gaps(results, "cost"),
-        "optimality_gap_radius": _gaps(results, "rmse_mm"),
+        "results": means,
+        "paired": paired,
+        "cvar5": _nested(benchmark, "cvar"),
+        "largest": {case: {name: largest[case].get(name, {}) for name in of} for case, of in means.items()},
+        "optimality_gap": {case: of for case, of in gaps["cost"].items() if of},
+        "optimality_gap_radius": {case: of for case, of in gaps["rmse_mm"].items() if of},
         "verdicts": {
-            result.case.name: {
-                agent: {"rival": result.rival, "rmse_mm_difference": _plain(difference), "wins": result.wins(agent)}
-                for agent, difference in result.verdicts.items()
+            case.name: {
+                agent: {
+                    "rival": benchmark.rival(case),
+                    "rmse_mm_difference": _plain(difference),
+                    "wins": difference.ends[1] < 0.0,
+                }
+                for agent, difference in benchmark.verdicts(case).items()
             }
-            for result in results
+            for case in benchmark.cases
         },
-        "provenance": _provenance(results, command),
+        "provenance": _provenance(benchmark, command),
     }
     return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
 
-def _plain(value: Any) -> Any:
-    """Estimates as dictionaries, at any depth of a mapping; what does not apply, NaN, as None."""
-    if isinstance(value, Mapping):
-        return {name: _plain(each) for name, each in value.items()}
-    if isinstance(value, Estimate):
-        ends = value.ci95 if value.ci95 and all(map(math.isfinite, value.ci95)) else None
-        return {"mean": value.mean if math.isfinite(value.mean) else None, "ci95": ends, "n": value.n}
-    return value
+def _nested(benchmark: Benchmark, kind: str) -> dict[str, dict[str, dict[str, Any]]]:
+    """The estimates of a kind by scenario, controller and metric."""
+    nested: dict[str, dict[str, dict[str, Any]]] = {case.name: {} for case in benchmark.cases}
+    frame = benchmark.estimates
+    for row in frame[(frame["kind"] == kind) & (frame["metric"] != OUTSIDE)].itertuples(index=False):
+        estimate = _plain(Estimate(row.mean, (row.low, row.high), row.n))
+        nested[row.scenario].setdefault(row.controller, {})[row.metric] = estimate
+    return nested
 
 
-def _gaps(results: Sequence[Result], metric: str) -> dict[str, Any]:
-    """The gaps in one metric, of the scenarios that have any."""
-    by_case = {
-        result.case.name: {name: _plain(gaps[metric]) for name, gaps in result.gaps.items() if metric in gaps}
-        for result in results
-    }
-    return {case: gaps for case, gaps in by_case.items() if gaps}
+def _plain(estimate: Estimate) -> dict[str, Any]:
+    """An estimate as a dictionary; numbers that do not apply, NaN, as None."""
+    ends = estimate.ci95 if estimate.ci95 and all(map(math.isfinite, estimate.ci95)) else None
+    return {"mean": estimate.mean if math.isfinite(estimate.mean) else None, "ci95": ends, "n": estimate.n}
 
 
-def _paired(result: Result) -> dict[str, Any]:
-    """The differences, with the probability of improvement beside that of RMSE."""
-    differences: dict[str, Any] = _plain(result.paired)
-    for name, each in result.improvement.items():
-        differences[name]["rmse_mm"]["probability_of_improvement"] = _plain(each["rmse_mm"])
-    return differences
-
-
-def _provenance(results: Sequence[Result], command: str) -> dict[str, Any]:
-    config, contenders = results[0].case.config(), [sample.contender for sample in results[0].samples]
+def _provenance(benchmark: Benchmark, command: str) -> dict[str, Any]:
+    config, contenders, earlier = benchmark.cases[0].config(), benchmark.contenders, benchmark.earlier_bound
     return {
         "command": command,
         **software(PACKAGES),
-        "contract": contract_hash([result.case for result in results]),
+        "contract": contract_hash(benchmark.cases),
         "plant_hash": config.plant_hash,
         "puller": config.puller.label,
         "parameters": {
@@ -138,88 +135,25 @@ def _provenance(results: Sequence[Result], command: str) -> dict[str, Any]:
         },
         "control_interval_s": config.control_interval,
         "horizon_s": config.horizon,
-        "scenarios": {result.case.name: _crystals(result) for result in results},
+        "scenarios": {case.name: _crystals(case, benchmark.seeds(case)) for case in benchmark.cases},
         "controllers": {each.name: {name: getattr(each, name) for name in FACTS} for each in contenders},
         "agents": [asdict(policy.contract) for each in contenders for policy in each.trained],
         "bootstrap": {"resamples": RESAMPLES, "seed": SEED, "paired_against": REFERENCE},
         "gap_measured_from": BOUND,
         "gap_from_cached_episodes": {
-            result.case.name: len(result.earlier_bound.seeds) for result in results if result.earlier_bound
+            str(name): len(rows) for name, rows in earlier.groupby("scenario", sort=False)
         },
-    }
+    }  # fmt: skip
 
 
-def _crystals(result: Result) -> dict[str, Any]:
-    case, scenario = result.case, result.case.config().sole_scenario
+def _crystals(case: Case, seeds: Sequence[int]) -> dict[str, Any]:
+    scenario = case.config().sole_scenario
     return {
         "scenario": scenario.name,
         "hash": scenario.hash,
         "model": case.model,
         "control_interval_s": case.control_interval,
         "meniscus": case.meniscus.name,
-        "first_seed": result.seeds[0],
-        "episodes": len(result.seeds),
+        "first_seed": seeds[0],
+        "episodes": len(seeds),
     }
-
-
-def to_csv(results: Sequence[Result]) -> str:
-    """Return the text of ``episodes.csv``, one line an episode."""
-    rows = (
-        (result.case.name, sample.name, training_seed, seed, *(f"{value:.5g}" for value in values))
-        for result in results
-        for sample in result.samples
-        for training_seed, episodes in zip(sample.contender.training_seeds or ("",), sample.values, strict=True)
-        for seed, values in zip(sample.seeds, episodes, strict=True)
-    )
-    text, heads = io.StringIO(), ("scenario", "controller", "training_seed", "seed", *results[0].samples[0].names)
-    csv.writer(text, lineterminator="\n").writerows([heads, *rows])
-    return text.getvalue()
-
-
-def read_results(path: Path, metrics: Sequence[str]) -> tuple[dict[str, dict[str, dict[str, Estimate]]], str]:
-    """Read a ``benchmark.json``: the estimates of these metrics by scenario and controller, and the contract's hash.
-
-    The hash is empty in a file of an earlier release. Raises CzError for other files.
-    """
-    with name_file_in_errors(path):
-        text = path.read_text("utf-8")
-    try:
-        content = json.loads(text)
-        results = {
-            scenario: {
-                name: {metric: _estimate(figures[metric]) for metric in metrics} for name, figures in by_name.items()
-            }
-            for scenario, by_name in content["results"].items()
-        }
-        return results, str(content.get("provenance", {}).get("contract", ""))
-    except (ValueError, KeyError, TypeError, AttributeError):
-        raise CzError(f"{path} is no benchmark.json") from None
-
-
-def _estimate(saved: Mapping[str, Any]) -> Estimate:
-    interval = saved.get("ci95")
-    return Estimate(float(saved["mean"]), interval and (float(interval[0]), float(interval[1])), saved.get("n", 0))
-
-
-def read_episodes(path: Path, columns: Sequence[str]) -> Episodes:
-    """Read some columns of an ``episodes.csv``, crystals in the file's order.
-
-    Raises CzError if the file is none of a benchmark's, holds what is no finite number, or a controller's training
-    seeds did not meet the same number of crystals.
-    """
-    lines: dict[str, dict[str, dict[str, list[list[float]]]]] = {}
-    with name_file_in_errors(path):
-        text = path.read_text("utf-8")
-    try:
-        for line in csv.DictReader(io.StringIO(text)):
-            by_seed = lines.setdefault(line["scenario"], {}).setdefault(line["controller"], {})
-            by_seed.setdefault(line["training_seed"], []).append([float(line[name]) for name in columns])
-        arrays = {
-            scenario: {name: np.array([*by_seed.values()]) for name, by_seed in by_name.items()}
-            for scenario, by_name in lines.items()
-        }
-        if not all(np.isfinite(values).all() for by_name in arrays.values() for values in by_name.values()):
-            raise ValueError
-    except (KeyError, TypeError, ValueError, csv.Error):
-        raise CzError(f"{path}: no episodes of a benchmark, or damaged") from None
-    return arrays

@@ -17,7 +17,7 @@ from cz_gym.baselines.tuned_controllers import CRYSTALS, LQGS, PIDS
 from cz_gym.body.process import BODY
 from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
-from cz_gym.evaluation.parallel import side_by_side
+from cz_gym.evaluation.parallel import run_parallel
 from cz_gym.puller.file import FOLDER, PullerFile, chosen_puller
 from cz_gym.support.command_line import OneLineParser, between, relative_path
 from cz_gym.support.errors import CzError
@@ -109,7 +109,7 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
         def poll_progress() -> None:
             bar.update(sum(tried(folder / f"{task[0].name}.json") for task in tasks) - bar.n)
 
-        for number, chosen in side_by_side(search_for, tasks, poll_progress, given.cluster, folder):
+        for number, chosen in run_parallel(search_for, tasks, poll_progress, given.cluster, folder):
             poll_progress()
             tuned = tasks[number][0]
             bar.write(f"{tuned.name}: {tuned.objectives[OWN_PULLER].kind(**chosen.facts['figures'])}")

@@ -224,7 +224,7 @@ def seeds(monkeypatch, few_crystals):
         return train_small(run, bar)
 
     monkeypatch.setattr(TrainingRun, "train", counted)
-    monkeypatch.setattr(training, "side_by_side", in_turn)
+    monkeypatch.setattr(training, "run_parallel", in_turn)
     monkeypatch.setattr(validation, "references", lambda *_: REFERENCES)
     monkeypatch.setitem(RECIPES, "ppo", SMALL_PPO)
     return seeds
@@ -308,5 +308,5 @@ def test_processes_train_the_same(tmp_path, monkeypatch):
         with tqdm(total=3, file=io.StringIO()) as bar:
             assert {run.seed for run, _ in training.train_seeds(runs, bar)} == {0, 1, 2}
             assert bar.n == pytest.approx(3)
-        monkeypatch.setattr(training, "side_by_side", in_turn)
+        monkeypatch.setattr(training, "run_parallel", in_turn)
     assert agents(tmp_path / "there") == agents(tmp_path / "here")

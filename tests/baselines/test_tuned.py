@@ -151,7 +151,7 @@ def test_one_command_designs_and_another_runs_it(tmp_path, monkeypatch, capsys):
     write_puller(find_puller("silicon-300mm"), place)
     figures = Scores(0.1, 0.01, 0.01, 0.1, 1900.0, 0.0, 5400)
     monkeypatch.setattr(tune, "Search", partial(Search, measure=lambda policy, config, seeds: figures))
-    monkeypatch.setattr(tune, "side_by_side", lambda function, tasks, *_: enumerate(map(function, tasks)))
+    monkeypatch.setattr(tune, "run_parallel", lambda function, tasks, *_: enumerate(map(function, tasks)))
     assert tune.main(["--puller", str(place), "--trials", "10"]) == 0
     for name in ("lqg-at-0.02", "paper-tuned", "pid-conventional"):
         kept = json.loads((tmp_path / "mine" / f"{name}.json").read_text())
@@ -184,7 +184,7 @@ def test_whole_crystals_of_a_puller_have_searches_of_their_own(tmp_path, monkeyp
         return CrystalScores(policy.control_interval, 0.5, 0.1, 0.01, 0.02)
 
     monkeypatch.setattr(tune, "Search", partial(Search, measure=figures))
-    monkeypatch.setattr(tune, "side_by_side", lambda function, tasks, *_: enumerate(map(function, tasks)))
+    monkeypatch.setattr(tune, "run_parallel", lambda function, tasks, *_: enumerate(map(function, tasks)))
     assert tune.main(["--puller", str(place), "--trials", "14", "--env", "CzCrystal-v0"]) == 0
     assert "crown's largest errors 2.00 mm, tail's 0.50 mm, 2 % lost" in capsys.readouterr().out
     assert {path.stem for path in (tmp_path / "mine").iterdir()} == {each.name for each in CRYSTALS}

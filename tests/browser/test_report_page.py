@@ -9,7 +9,7 @@ import pytest
 
 from cz_gym.tools.report.page import page
 from tests.browser.chromium import chromium, pytestmark, resize, until  # noqa: F401
-from tests.samples import result_of
+from tests.samples import joined, result_of
 
 EVIL = "</script><img src=x onerror=document.title='evil'>\"'&amp;<b>%{x}<a href=\"javascript:alert(1)\">a</a>"
 PICTURES = ("pareto", "crystal")
@@ -22,7 +22,7 @@ WATCH = """new MutationObserver(() => document.querySelector(".main-svg") && per
 def made():
     """Two controllers and an agent with a name that is markup, on two scenarios."""
     names = ("open-loop", "paper", "pid-conventional")
-    return [result_of(name, names, EVIL)[0] for name in ("puller", "reference-b")]
+    return joined([result_of(name, names, EVIL)[0] for name in ("puller", "reference-b")])
 
 
 @pytest.fixture(scope="module")

@@ -22,13 +22,13 @@ from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.engine.tangents import DifferentiableBatch
 from cz_gym.evaluation.protocol import Case, Contender
-from cz_gym.evaluation.results import summarise
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.jit import force_inlined, jittable
 from cz_gym.physics.schedule import bias_offset, recipe, reference
 from cz_gym.process import DONE, GROWS, LOST, PULL_SCALE, Channel, Inputs, Past, PerfectReadings, Process, Relative
-from cz_gym.tools.report.tables import DRIVES, ERROR, rows
-from cz_gym.tools.run import run_episodes
+from cz_gym.tools.report.tables import rows
+from cz_gym.tools.run import run as benchmark
+from cz_gym.tools.task_records import BODY_DRIVES, BODY_ERROR
 from tests.vector_checker import check_vector_env
 
 # The process: at most 80 lines to the mark below.
@@ -244,7 +244,7 @@ def test_it_ends_with_success_once_enough_was_fed():
     assert env._batch.memory.slots["fed"][0] == pytest.approx(0.2, abs=20 * PULL_SCALE)
 
 
-def test_a_pid_in_rollout_and_table():
+def test_a_pid_in_rollout_and_table(tmp_path):
     """Against a policy that does nothing; metrics of what a tank has not are left out."""
     row = Case("tank", "randomized", "a tank", process=TANK)
     config = replace(row.config(), horizon=7200.0)
@@ -253,9 +253,9 @@ def test_a_pid_in_rollout_and_table():
     rmse = [np.sqrt(np.mean(np.square(each.signals.h - each.signals.h_ref))) for each in (run, still)]
     assert rmse[0] < 0.5 * rmse[1]
     contender = Contender("pid", lambda config: Integrating(), "measured", "a PID")
-    result = summarise(row, [run_episodes(contender, row, range(4), lambda steps: None)])
-    (line,) = rows(result, (*ERROR, *DRIVES))
-    told = dict(zip(("name", *(column.metric for column in (*ERROR, *DRIVES))), line, strict=True))
+    found, columns = benchmark([contender], [row], 4, tmp_path, quiet=True), (*BODY_ERROR, *BODY_DRIVES)
+    (line,) = rows(found, row, columns)
+    told = dict(zip(("name", *(column.metric for column in columns)), line, strict=True))
     assert told["growth_rate_rms_mm_per_min"] == "-"
     assert float(told["rmse_mm"].split()[0]) < 1.0
     assert float(told["failure_rate"].split()[0]) == 0.0

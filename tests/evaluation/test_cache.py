@@ -13,12 +13,12 @@ import cz_gym.agents
 from cz_gym.baselines import OpenLoop
 from cz_gym.baselines.clairvoyant import Clairvoyant
 from cz_gym.config import make_config
-from cz_gym.evaluation.metrics import metric_names
+from cz_gym.evaluation.metrics import SPEED, Metrics, metrics, names_of
 from cz_gym.evaluation.protocol import Case, Contender
-from cz_gym.evaluation.results import Sample
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.tools import benchmark, registry, run
+from cz_gym.tools import benchmark, registry
 from cz_gym.tools import run as runner
+from cz_gym.tools.episodes import values_of
 from cz_gym.tools.run import code_behind, sources_behind
 from tests.observed import PLAIN
 
@@ -59,8 +59,7 @@ class Fixed(Case):
 
 def sample(folder, policy=None, config=CONFIG, seeds=SEEDS):
     row = Fixed("some", "randomized", "", given=config, these=seeds)
-    (result,) = runner.run([slow(policy or Snail())], [row], 500, folder)
-    return result.samples[0]
+    return runner.run([slow(policy or Snail())], [row], 500, folder)
 
 
 @pytest.fixture
@@ -79,15 +78,20 @@ def counted(monkeypatch):
     return ran
 
 
+def values(benchmark):
+    return values_of(benchmark.episodes, names_of(Metrics))[0]
+
+
 def test_episodes_are_run_once_and_are_those_of_one_rollout(tmp_path, counted):
+    """But for the first, which runs again for its signals."""
     first, again = sample(tmp_path, seeds=range(2)), sample(tmp_path)
-    direct = Sample.of(slow(Snail()), [rollout(OpenLoop(), CONFIG, SEEDS)])
-    assert counted == [0, 1, 2, 3, 4]
-    assert again.seeds == direct.seeds
-    assert again.microseconds > 0.0
-    np.testing.assert_allclose(again.values, direct.values, rtol=1e-12)
-    np.testing.assert_array_equal(again.values[:, :2], first.values)
-    for ours, theirs in zip(again.example or (), direct.example or (), strict=True):
+    assert counted == [0, 1, 0, 2, 3, 4]
+    direct = rollout(OpenLoop(), CONFIG, SEEDS)
+    assert again.episodes["seed"].tolist() == [*SEEDS]
+    assert (again.episodes[SPEED] > 0.0).all()
+    np.testing.assert_allclose(values(again), np.stack(metrics(direct), axis=-1), rtol=1e-12)
+    np.testing.assert_array_equal(values(again)[:2], values(first))
+    for ours, theirs in zip(again.signals["some", "snail"], direct.episode(0), strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 
@@ -97,8 +101,8 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path, counted):
     with pytest.raises(KeyboardInterrupt):
         sample(tmp_path)
     counted.clear()
-    assert sample(tmp_path).values.shape == (1, 5, len(metric_names()))
-    assert counted == [2, 3, 4]
+    assert values(sample(tmp_path)).shape == (5, len(names_of(Metrics)))
+    assert counted == [0, 2, 3, 4]
 
 
 def test_cached_episodes_serve_no_other_settings_plant_or_scenario(tmp_path, counted):
@@ -114,20 +118,22 @@ def test_cached_episodes_serve_no_other_settings_plant_or_scenario(tmp_path, cou
     assert counted == [0] * 5
 
 
-def test_a_damaged_file_and_a_first_episode_without_signals_are_run_again(tmp_path, counted):
+def test_a_damaged_file_is_written_anew_and_rows_of_other_settings_stay(tmp_path, counted):
     whole = sample(tmp_path, seeds=range(2))
-    assert sample(tmp_path, seeds=range(1, 2)).example is not None
-    for path in tmp_path.glob("*/1.npz"):
-        path.write_bytes(path.read_bytes()[:100])
-    np.testing.assert_allclose(sample(tmp_path, seeds=range(2)).values, whole.values, rtol=1e-12)
-    assert counted == [0, 1, 1, 1]
+    sample(tmp_path, Snail(setting=1.0), seeds=range(2))
+    np.testing.assert_array_equal(values(sample(tmp_path, seeds=range(2))), values(whole))
+    assert counted == [0, 1, 0, 1, 0]
+    (file,) = tmp_path.iterdir()
+    file.write_bytes(file.read_bytes()[:-20])
+    np.testing.assert_array_equal(values(sample(tmp_path, seeds=range(2))), values(whole))
+    assert counted[5:] == [0, 1]
 
 
-@pytest.mark.parametrize("package", run.COMPUTING)
+@pytest.mark.parametrize("package", runner.COMPUTING)
 def test_another_version_of_a_package_that_computes_runs_cached_episodes_again(package, tmp_path, counted, monkeypatch):
     sample(tmp_path, seeds=range(1))
-    versions = run.software(run.COMPUTING)["packages"]
-    monkeypatch.setattr(run, "software", lambda packages: {"packages": {**versions, package: "99"}})
+    versions = runner.software(runner.COMPUTING)["packages"]
+    monkeypatch.setattr(runner, "software", lambda packages: {"packages": {**versions, package: "99"}})
     sample(tmp_path, seeds=range(1))
     assert counted == [0, 0]
 

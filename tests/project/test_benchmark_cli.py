@@ -18,14 +18,15 @@ from cz_gym import agents
 from cz_gym.agents import shipped_names
 from cz_gym.agents.contract import write_agent
 from cz_gym.config import make_config
-from cz_gym.evaluation.metrics import metric_names
-from cz_gym.evaluation.parallel import through
+from cz_gym.evaluation.metrics import SPEED, Metrics, names_of
+from cz_gym.evaluation.parallel import run_tasks
 from cz_gym.evaluation.protocol import CASES, TEST_SEEDS, find_case
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.spaces import OBSERVATIONS
 from cz_gym.support.errors import CzError
 from cz_gym.tools import benchmark, run
+from cz_gym.tools.episodes import read_episodes, values_of
 from cz_gym.tools.files import check_targets
 from cz_gym.tools.registry import CONTROLLERS
 from tests.contracts import LINEAR, facts, model_of
@@ -125,7 +126,7 @@ def test_whole_crystals_are_quoted_in_two_pages(crystals, tmp_path, monkeypatch)
         page.write_text(
             "a\n<!-- crystal:begin -->\n<!-- crystal:end -->\n<!-- benchmark:begin -->\n<!-- benchmark:end -->"
         )
-    monkeypatch.setattr(benchmark, "CRYSTALS", tmp_path / "results")
+    monkeypatch.setattr(benchmark, "RESULTS", tmp_path)
     monkeypatch.setattr(benchmark, "README", pages[0])
     monkeypatch.setattr(benchmark, "CRYSTAL_PAGE", pages[1])
     monkeypatch.setattr(benchmark, "is_partial", lambda *_: False)
@@ -142,8 +143,9 @@ def test_processes_side_by_side_find_the_same(finished, tmp_path, monkeypatch):
     monkeypatch.setattr(run, "LONG", 0)
     agents = [f"--agent={finished.parent / f'{seed}.onnx'}" for seed in (3, 8)]
     assert benchmark.main([*SMALL, "--out", str(tmp_path / "apart"), "--quiet", *agents]) == 0
-    for file in ("episodes.csv", "crystal.png"):
-        assert (tmp_path / "apart" / file).read_bytes() == (finished / file).read_bytes()
+    assert (tmp_path / "apart" / "crystal.png").read_bytes() == (finished / "crystal.png").read_bytes()
+    tables = (read_episodes(folder / "episodes.csv").drop(columns=SPEED) for folder in (tmp_path / "apart", finished))
+    assert next(tables).equals(next(tables))
     ours, theirs = (json.loads((out / "benchmark.json").read_text()) for out in (tmp_path / "apart", finished))
     for part in ("paired", "cvar5", "verdicts"):
         assert ours[part] == theirs[part] != {}
@@ -155,8 +157,8 @@ def test_json_names_every_metric_of_everyone(data):
     for name, scenario in data["results"].items():
         assert list(scenario) == ["open-loop", "paper", "ppo"]
         for controller, found in scenario.items():
-            assert set(found) == {*metric_names(), "microseconds_per_step"}
-            for metric in metric_names():
+            assert set(found) == {*names_of(Metrics), "microseconds_per_step"}
+            for metric in names_of(Metrics):
                 mean, interval, n = (found[metric][part] for part in ("mean", "ci95", "n"))
                 assert n == (3 if name == "randomized" else 1)
                 if metric == "rmse_survivors_mm":
@@ -228,7 +230,7 @@ def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path):
 @pytest.mark.usefixtures("no_work")
 def test_files_are_replaced_by_a_full_run_or_when_told_to(tmp_path, finished, monkeypatch, refusal):
     """For results named by every option, and for other files of the user."""
-    monkeypatch.setattr(benchmark, "FOLDER", finished)
+    monkeypatch.setattr(benchmark, "folder_of", lambda arguments: finished)
     results, page = finished / "benchmark.json", tmp_path / "report.html"
     page.write_text("precious")
     for arguments in ([], ["--out", str(finished)], ["--json", str(results)], ["--out", str(tmp_path)]):
@@ -249,7 +251,7 @@ def test_a_full_run_is_quoted_in_the_readme(tmp_path, monkeypatch):
     page.write_text("before\n<!-- benchmark:begin -->\nold\n<!-- benchmark:end -->\nafter\n")
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "benchmark.json").write_text("old")
-    monkeypatch.setattr(benchmark, "FOLDER", tmp_path / "results")
+    monkeypatch.setattr(benchmark, "folder_of", lambda arguments: tmp_path / "results")
     monkeypatch.setattr(benchmark, "README", page)
     assert benchmark.main([*ONE, "--overwrite"]) == 0
     assert "old" in page.read_text()
@@ -338,18 +340,17 @@ def test_everything_of_a_benchmark_passes_to_other_processes_as_a_value(method, 
     own = [part for name in ("Still", "still", "made") for part in ("--controller", f"mine.py:{name}")]
     arguments = benchmark.parse([*own, "--scenario", "mine.py:later", "--controllers", "paper-tuned,lqg,ppo"])
     (row,) = benchmark.cases_of(arguments)
-    tasks = [run.Task(each, row, 1, tmp_path) for each in benchmark.contenders_of(arguments, [row])]
+    tasks = [(each, row, row.seeds(1), tmp_path) for each in benchmark.contenders_of(arguments, [row])]
     monkeypatch.chdir("/")
     with ProcessPoolExecutor(1, get_context(method)) as pool:
-        found = dict(through(pool, values, tasks))
+        found = dict(run_tasks(pool, values, tasks))
     for number, task in enumerate(tasks):
-        sample = run.measure(task, lambda steps: None)
-        np.testing.assert_array_equal(found[number], sample.values)
+        np.testing.assert_array_equal(found[number], values(task))
     assert pickle.loads(pickle.dumps([*CONTROLLERS, *CASES]))[-len(CASES) :] == [*CASES]
 
 
 def values(task):
-    return run.measure(task, lambda steps: None).values
+    return values_of(run.run_task(task)[0], names_of(Metrics))
 
 
 def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(tmp_path, monkeypatch):

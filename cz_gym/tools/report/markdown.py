@@ -1,25 +1,22 @@
-"""The report for a puller, which a grower reads: diameters, scrap, v/G, margins of the loops, and a recommendation."""
+"""The report in Markdown, short tables for a terminal, and the report for a puller, which a grower reads."""
 
 import shlex
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from cz_gym.baselines.analysis import linear_form, loop_margins
-from cz_gym.crystal.process import CRYSTAL
-from cz_gym.evaluation.plots import chosen
-from cz_gym.evaluation.protocol import Case, contract_hash
-from cz_gym.evaluation.results import BOUND, REFERENCE, Result, Sample, common
-from cz_gym.evaluation.statistics import Estimate, Resamples, means
+from cz_gym.evaluation.metrics import OUTSIDE
+from cz_gym.evaluation.protocol import BOUND, REFERENCE, Case, Contender
 from cz_gym.physics.plant import make_puller
 from cz_gym.puller.file import DEFAULT
 from cz_gym.support.errors import CzError
-from cz_gym.support.units import HOUR, MM, PERCENT
+from cz_gym.support.units import MM, PERCENT
+from cz_gym.tools.episodes import Benchmark
+from cz_gym.tools.task_records import BODY_DRIVES, contract_hash, task_of
 
-from .crystals import contents_of
 from .tables import (
-    DRIVES,
     FAILURES,
     FEWEST,
     HEATER_STEP,
@@ -28,10 +25,11 @@ from .tables import (
     RMSE,
     WHO,
     Column,
+    Table,
+    chosen,
     comparison,
     crystals,
     deciding,
-    label,
     rows,
     too_few,
     who,
@@ -50,7 +48,7 @@ BESIDE = (
     VG,
     PULL_STEP,
     HEATER_STEP,
-    next(column for column in DRIVES if column.metric == "time_at_limits"),
+    next(column for column in BODY_DRIVES if column.metric == "time_at_limits"),
 )
 """Columns beside the scrap."""
 SHORT = 5
@@ -72,80 +70,75 @@ def title(case: Case) -> str:
     return f"Puller {case.puller.name}, {2.0 * case.puller.parameters.r_0 / MM:g} mm in diameter"
 
 
-def band(result: Result) -> str:
-    """The tolerance band of the diameter in words."""
-    return f"±{2.0 * (result.case.tolerance or 0.0) / MM:g} mm"
+def band(case: Case) -> str:
+    """Return the tolerance band of the diameter in words."""
+    return f"±{2.0 * (case.tolerance or 0.0) / MM:g} mm"
 
 
-def scrap(sample: Sample) -> Estimate | None:
-    """Share of the time in which the diameter is outside the tolerance band, to the horizon once a crystal is lost."""
-    if sample.outside is None:
-        return None
-    return means(sample.outside[:, :, None], Resamples.draw(len(sample.seeds)))[0]
+def outcome(benchmark: Benchmark, case: Case, interval: bool = True) -> Table:
+    """Return heads and rows of a scenario's table for a grower, the fewest losses first; short without ``interval``."""
+    head = f"scrap: diameter outside {band(case)}" if interval else f"outside {band(case)}"
+    scrap = Column(OUTSIDE, f"{head} [% of time]", 2, PERCENT)
+    columns = [each._replace(interval=interval) for each in (scrap, *BESIDE[: None if interval else SHORT])]
+    ranked = sorted(benchmark.contenders, key=lambda each: _losses(benchmark, [case], each.name))
+    heads = ("controller", *(column.heading for column in columns))
+    return heads, rows(benchmark.only(contenders=ranked), case, columns)
 
 
-def outcome(result: Result, interval: bool = True) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Heads and rows of a scenario's table for a grower, the fewest losses first; short without ``interval``."""
-    head = f"scrap: diameter outside {band(result)}" if interval else f"outside {band(result)}"
-    columns = Column("", f"{head} [% of time]", 2, PERCENT), *BESIDE[: None if interval else SHORT]
-    column, *beside = (each._replace(interval=interval) for each in columns)
-    rows = [
-        (label(sample, result), column.text(scrap(sample)), *(c.text(c.estimate(result, sample.name)) for c in beside))
-        for sample in sorted(result.samples, key=lambda sample: _order([result], sample))
-    ]
-    return ("controller", column.heading, *(each.heading for each in beside)), rows
-
-
-def _order(results: Sequence[Result], sample: Sample) -> tuple[float, float]:
+def _losses(benchmark: Benchmark, cases: Sequence[Case], name: str) -> tuple[float, float]:
     """Mean shares of lost crystals and of scrap of a contender over some scenarios."""
-    own = [one for result in results for one in result.samples if one.name == sample.name]
-    lost = np.mean([one.metric("failure_rate").mean() for one in own])
-    return float(lost), float(np.mean([estimate.mean if (estimate := scrap(one)) else np.inf for one in own]))
+    lost, scrap = (
+        [benchmark.mean(case, name, metric) for case in cases] for metric in (FAILURES.metric, OUTSIDE)
+    )  # fmt: skip
+    return float(np.mean(lost)), float(np.mean(scrap))
 
 
-def recommendation(results: Sequence[Result]) -> str:
-    """Who loses the fewest crystals and, of those, makes the least scrap; bounds and a few crystals do not count."""
-    counted = deciding(results)
-    able, number = [one for one in counted[0].samples if not one.contender.bound], len(counted[0].seeds)
-    if not able or too_few(counted):
+def recommendation(benchmark: Benchmark) -> str:
+    """Recommend the controller with the fewest lost crystals, then the least scrap.
+
+    Bounds do not count, and a few crystals give no recommendation.
+    """
+    cases = deciding(benchmark)
+    able, number = [each for each in benchmark.contenders if not each.bound], len(benchmark.seeds(cases[0]))
+    if not able or too_few(benchmark):
         return f"No recommendation: {crystals(number)}, and it takes a controller and at least {FEWEST}."
-    best = min(able, key=lambda sample: _order(counted, sample))
-    lost, share = _order(counted, best)
-    steady = np.mean([result.means[best.name][VG.metric].mean for result in counted])
-    machine, who = counted[0].case.puller.name, best.name
+    best = min(able, key=lambda each: _losses(benchmark, cases, each.name))
+    lost, share = _losses(benchmark, cases, best.name)
+    steady = np.mean([benchmark.mean(case, best.name, VG.metric) for case in cases])
+    machine = cases[0].puller.name
     fate = (
-        f"Recommended for {machine}: {who}, which loses {f'{lost / PERCENT:.2g} %' if lost else 'none'}"
+        f"Recommended for {machine}: {best.name}, which loses {f'{lost / PERCENT:.2g} %' if lost else 'none'}"
         if lost <= FIT
-        else f"No controller is fit for {machine}: {who} loses the fewest crystals, {lost / PERCENT:.2g} %"
+        else f"No controller is fit for {machine}: {best.name} loses the fewest crystals, {lost / PERCENT:.2g} %"
     )
-    up, down, phase, delay = _margins(best, counted[0])
+    up, down, phase, delay = _margins(best, cases[0])
     loop = (
         f" Its loop bears {down} to {up} times its gain, {phase} degrees and a delay of {delay} s."
         if delay != NOTHING
         else ""
     )
     return (
-        f"{fate} of {crystals(number)} on {' and '.join(result.case.name for result in counted)}. The diameter is "
-        f"outside {band(counted[0])} for {share / PERCENT:.2g} % of the time (scrap), and v/G is within 3 % for "
+        f"{fate} of {crystals(number)} on {' and '.join(case.name for case in cases)}. The diameter is "
+        f"outside {band(cases[0])} for {share / PERCENT:.2g} % of the time (scrap), and v/G is within 3 % for "
         f"{steady / PERCENT:.3g} %.{loop}"
     )
 
 
-def margins(samples: Sequence[Sample], result: Result) -> list[tuple[str, ...]]:
-    """A row for each controller: margins of its sampled loop, opened at the ring, on the worse of Models I and II."""
-    return [(sample.name, *_margins(sample, result)) for sample in samples]
+def margins(benchmark: Benchmark) -> list[tuple[str, ...]]:
+    """Return a row a controller: margins of its sampled loop, opened at the ring, on the worse of Models I and II."""
+    return [(each.name, *_margins(each, benchmark.cases[0])) for each in benchmark.contenders]
 
 
-def _margins(sample: Sample, result: Result) -> tuple[str, ...]:
-    config = result.case.config(sample.contender.observation, sample.contender.action)
+def _margins(contender: Contender, case: Case) -> tuple[str, ...]:
+    config = case.config(contender.observation, contender.action)
     absent = (NOTHING,) * (len(MARGINS) - 1)
-    if sample.contender.learned:
+    if contender.learned:
         return absent
     try:
-        form = linear_form(sample.contender.make(config), config.sole_scenario.sensor)
+        form: Any = linear_form(contender.make(config), config.sole_scenario.sensor)
     except (CzError, AttributeError):  # it has no linear form, or is no feedback
         return absent
-    pullers = [make_puller(config.parameters, mix, config.meniscus) for mix in (1.0, 0.0)]
+    pullers = [make_puller(config.parameters, weight, config.meniscus) for weight in (1.0, 0.0)]
     loops = [loop_margins(form.controller, puller, form.dt) for puller in pullers]
     if any(np.isnan(loop.sensitivity) for loop in loops):
         return ("unstable", *absent[1:])
@@ -154,141 +147,94 @@ def _margins(sample: Sample, result: Result) -> tuple[str, ...]:
     return tuple("no limit" if np.isnan(both).all() else f"{pick(both):.3g}" for pick, both in values)
 
 
-# The benchmark's report as text: in Markdown, which begins with the verdict, and as short tables for a terminal.
+# The report of any benchmark, which begins with the verdict.
 
-ROWS = 8
-"""Number of controllers in a page's short table."""
 MARKERS = "<!-- {}:begin -->", "<!-- {}:end -->"
 """Markers around the part of a page that :func:`fill_in` writes."""
 
 
-def summary(results: Sequence[Result]) -> str:
-    """Return :func:`overview` in Markdown, and its contract below."""
-    heads, groups = contents_of(results[0].case).overview(results)
+def summary(benchmark: Benchmark) -> str:
+    """Return the overview in Markdown, and its contract below."""
+    heads, groups = task_of(benchmark.cases[0]).overview(benchmark)
     lines = [line for group, listed in groups.items() for line in ((f"*{group}*", *[""] * (len(heads) - 1)), *listed)]
-    contract = contract_hash([result.case for result in results])
     rests_on = "plant, random scenarios, interval, horizon, reward, metrics"
-    return f"{table(heads, lines)}\n\nContract `{contract}` ({rests_on})."
+    return f"{table(heads, lines)}\n\nContract `{contract_hash(benchmark.cases)}` ({rests_on})."
 
 
-def brief(results: Sequence[Result]) -> str:
+def brief(benchmark: Benchmark) -> str:
     """Return :func:`summary` of the random scenarios, of the controllers that a figure would show first."""
-    first, *others = deciding(results)
-    if first.case.process == CRYSTAL:
-        return summary(results)
-    return summary([replace(first, samples=tuple(chosen(first.samples, ROWS))), *others])
+    cases = deciding(benchmark)
+    return summary(benchmark.only(cases, chosen(benchmark, cases[0], task_of(cases[0]).quoted_rows)))
 
 
-def fill_in(page: str, results: Sequence[Result]) -> str:
+def fill_in(page: str, benchmark: Benchmark) -> str:
     """Return a page with :func:`brief` between its two markers; the page itself if it has none."""
-    name = "crystal" if results[0].case.process == CRYSTAL else "benchmark"
-    first, last = (marker.format(name) for marker in MARKERS)
+    first, last = (marker.format(task_of(benchmark.cases[0]).name) for marker in MARKERS)
     before, begin, rest = page.partition(first)
     _, end, after = rest.partition(last)
-    return f"{before}{begin}\n{brief(results)}\n{end}{after}" if end else page
+    return f"{before}{begin}\n{brief(benchmark)}\n{end}{after}" if end else page
 
 
-def markdown(results: Sequence[Result], command: str, figures: Iterable[str]) -> str:
-    """Return ``report.md``; it begins with :func:`verdict`."""
-    case = results[0].case
+def markdown(benchmark: Benchmark, command: str, figures: Iterable[str]) -> str:
+    """Return ``report.md``; it begins with the verdict, on a puller with the recommendation."""
+    case = benchmark.cases[0]
     parts = [
-        *(_verdict(results) if case.tolerance is None else _for_a_grower(results)),
+        *(_verdict(benchmark) if case.tolerance is None else _for_a_grower(benchmark)),
         "# Benchmark",
-        *(_of_crystals(results) if case.process == CRYSTAL else _of_bodies(results)),
-        summary(results),
+        *task_of(case).introduction(benchmark),
+        summary(benchmark),
         *(f"![{name.removesuffix('.png')}]({name})" for name in figures),
         "## Who took part",
-        table(WHO, who(results[0].samples), rule="---"),
+        table(WHO, who(benchmark.contenders), rule="---"),
+        *(part for case in benchmark.cases for part in _scenario(benchmark, case)),
+        "## How it was made",
+        f"`{command}`; versions, hashes and seeds stand in benchmark.json.",
     ]
-    for result in results:
-        parts += _scenario(result)
-    parts += ["## How it was made", f"`{command}`; versions, hashes and seeds stand in benchmark.json."]
     return "\n\n".join(parts) + "\n"
 
 
-INTERVALS = (
-    "The tables show means over crystals with 95 % bootstrap intervals; a scenario without randomness is one crystal "
-    "and has no interval."
-)
-
-
-def _none_of(results: Sequence[Result]) -> str:
-    most = max(len(result.seeds) for result in results)
-    return f"No failure in n crystals still allows a rate of up to 3/n, {3 / most / PERCENT:.2g} % at n = {most}."
-
-
-def _of_bodies(results: Sequence[Result]) -> list[str]:
-    """What was measured, and how it counts."""
-    case = results[0].case
-    config = case.config()
-    return [
-        f"Every controller meets the same crystals (test seeds), {config.horizon / HOUR:.3g} h each at "
-        f"{config.control_interval:g} s control, on {case.grown_on}.",
-        f"{INTERVALS} After a failure the radius error counts {config.radius_limit / MM:.3g} mm to "
-        f"the end; drives, growth rate and ground-off are those of the time before it. {_none_of(results)} The verdict "
-        "compares radius errors alone: who moves the pull speed more can have less. docs/controllers/bounds.md "
-        "compares at equal pull steps, docs/benchmark.md has the protocol and every formula.",
-        "RMSE of the true radius [mm] with 95 % interval and failures on each scenario, pull steps on the first.",
-    ]
-
-
-def _of_crystals(results: Sequence[Result]) -> list[str]:
-    """The same of whole crystals."""
-    case = results[0].case
-    return [
-        f"Every controller meets the same whole crystals, or parts of them (test seeds), at {case.control_interval:g} "
-        f"s control, on {case.grown_on}.",
-        f"{INTERVALS} Errors are those of the true radius against the recipe's at the length grown; a crystal that is "
-        f"lost in crown or tail has the largest allowed one there. What is said of the body is said of the length that "
-        f"was grown. {_none_of(results)} docs/crystal.md explains every column.",
-        "Losses on each stage; crown, body and tail where the stage grows them; energy is the body's, if there is one.",
-    ]
-
-
-def _verdict(results: Sequence[Result]) -> list[str]:
-    verdict = contents_of(results[0].case).verdict(results)
+def _verdict(benchmark: Benchmark) -> list[str]:
+    verdict = task_of(benchmark.cases[0]).verdict(benchmark)
     return [verdict.sentence, *([table(verdict.heads, verdict.rows)] if verdict.rows else [])]
 
 
-def _for_a_grower(results: Sequence[Result]) -> list[str]:
+def _for_a_grower(benchmark: Benchmark) -> list[str]:
     """The recommendation, what each controller gives on each scenario, and how much its loop bears."""
-    parts = [recommendation(results), f"# {title(results[0].case)}"]
-    for result in results:
-        parts += [f"**{result.case.name}**: {result.case.meaning}.", table(*outcome(result))]
-    margin_table = table(MARGINS, margins(results[0].samples, results[0]))
-    agents = any(sample.contender.learned for sample in results[0].samples)
-    return [*parts, EXPLAINED, margin_table, MARGINS_EXPLAINED, *(_verdict(results) if agents else [])]
+    parts = [recommendation(benchmark), f"# {title(benchmark.cases[0])}"]
+    for case in benchmark.cases:
+        parts += [f"**{case.name}**: {case.meaning}.", table(*outcome(benchmark, case))]
+    agents = any(each.learned for each in benchmark.contenders)
+    parts += [EXPLAINED, table(MARGINS, margins(benchmark)), MARGINS_EXPLAINED]
+    return [*parts, *(_verdict(benchmark) if agents else [])]
 
 
-def _scenario(result: Result) -> list[str]:
-    meaning, shown = result.case.meaning, contents_of(result.case)
-    parts = [
-        f"## {result.case.name} ({crystals(len(result.seeds))})",
+def _scenario(benchmark: Benchmark, case: Case) -> list[str]:
+    meaning, task, compared = case.meaning, task_of(case), comparison(benchmark, case)
+    pooled = [each.name for each in benchmark.contenders if len(each.training_seeds) > 1]
+    return [
+        f"## {case.name} ({crystals(len(benchmark.seeds(case)))})",
         f"{meaning[0].upper()}{meaning[1:]}.",
-        *(_metrics(result, columns) for columns in shown.columns),
-        *([table(*shown.losses(result))] if shown.losses else []),
+        *(_metrics(benchmark, case, columns) for columns in task.columns),
+        *([table(*task.losses(benchmark, case))] if task.losses else []),
+        *([_metrics(benchmark, case, compared), *filter(None, [measured_from(benchmark, case)])] if compared else []),
+        *([_training_seeds(benchmark, case, pooled)] if pooled else []),
     ]
-    if columns := comparison(result):
-        parts += [_metrics(result, columns), *filter(None, [measured_from(result)])]
-    pooled = [sample for sample in result.samples if len(sample.contender.training_seeds) > 1]
-    if pooled:
-        parts.append(_training_seeds(pooled))
-    return parts
 
 
-def _metrics(result: Result, columns: Sequence[Column]) -> str:
-    return table(("controller", *(column.heading for column in columns)), rows(result, columns))
+def _metrics(benchmark: Benchmark, case: Case, columns: Sequence[Column]) -> str:
+    return table(("controller", *(column.heading for column in columns)), rows(benchmark, case, columns))
 
 
-def measured_from(result: Result) -> str:
+def measured_from(benchmark: Benchmark, case: Case) -> str:
     """Return a sentence on where the optimality gap comes from, or how to get it; none on a grower's puller."""
-    case, bound = result.case, result.earlier_bound
     if case.tolerance is not None:
         return ""
-    if bound is not None:
-        count = crystals(len(common(bound, *result.samples)[0].seeds))
-        return f"Optimality gaps are measured from `{BOUND}` of an earlier run (results/bounds), on the first {count}."
-    if any(result.gaps.values()):
+    names, earlier = [each.name for each in benchmark.contenders], benchmark.earlier_bound
+    if met := int((earlier["scenario"] == case.name).sum()):
+        fewest = min([met, *(len(benchmark.seeds(case, name)) for name in names)])
+        found = f"`{BOUND}` of an earlier run (results/bounds), on the first {crystals(fewest)}."
+        return f"Optimality gaps are measured from {found}"
+    if any(benchmark.get(case, name, "cost", "gap") for name in names):
         return f"Optimality gaps are measured from `{BOUND}` on the crystals that it met."
     place = f"--scenario {shlex.quote(case.file)}" if case.file else f"--scenarios {case.name}"
     return (
@@ -297,38 +243,42 @@ def measured_from(result: Result) -> str:
     )
 
 
-def _training_seeds(pooled: Sequence[Sample]) -> str:
+def _training_seeds(benchmark: Benchmark, case: Case, pooled: Sequence[str]) -> str:
     """Mean RMSE of each agent's best, middle and worst training seed, and the crystals that each of them lost."""
     lines = []
-    for sample in pooled:
-        seeds = sample.contender.training_seeds
-        errors, lost = sample.metric("rmse_mm").mean(axis=1), sample.metric("failure_rate").sum(axis=1)
-        figures = (f"{value:.3f}" for value in (errors.min(), np.median(errors), errors.max()))
+    for each in (each for each in benchmark.contenders if each.name in pooled):
+        seeds, (errors, failed) = each.training_seeds, (
+            benchmark.values(case, each.name, metric) for metric in (RMSE.metric, FAILURES.metric)
+        )  # fmt: skip
+        means, lost = errors.mean(axis=1), failed.sum(axis=1)
+        figures = (f"{value:.3f}" for value in (means.min(), np.median(means), means.max()))
         losses = [f"{count:.0f} by seed {seed}" for seed, count in zip(seeds, lost, strict=True) if count]
-        worst = str(seeds[int(errors.argmax())])
-        losers = ", ".join(losses) or "none"
-        lines.append((sample.name, str(len(seeds)), *figures, worst, losers, str(len(sample.seeds))))
+        worst, losers = str(seeds[int(means.argmax())]), ", ".join(losses) or "none"
+        lines.append((each.name, str(len(seeds)), *figures, worst, losers, str(errors.shape[1])))
     figures_of = ("best [mm]", "median [mm]", "worst [mm]")
     return table(("agent", "training seeds", *figures_of, "worst seed", "crystals lost", "of"), lines)
 
 
-def terminal(results: Sequence[Result]) -> str:
+def terminal(benchmark: Benchmark) -> str:
     """Return a short table a scenario, RMSE with its interval, then means, and the verdict or the recommendation."""
-    verdict = contents_of(results[0].case).verdict(results, RMSE._replace(interval=False))
-    parts = [*map(_short, results), *([verdict.sentence] if verdict.rows or results[0].case.tolerance is None else [])]
+    task, graded = task_of(benchmark.cases[0]), benchmark.cases[0].tolerance is not None
+    verdict = task.verdict(benchmark, RMSE._replace(interval=False))
+    parts = [_short(benchmark, case) for case in benchmark.cases]
+    parts += [verdict.sentence] if verdict.rows or not graded else []
     parts += [_aligned(verdict.heads, verdict.rows)] if verdict.rows else []
-    return "\n\n".join(parts + ([recommendation(results)] if results[0].case.tolerance else []))
+    return "\n\n".join(parts + ([recommendation(benchmark)] if graded else []))
 
 
-def _short(result: Result) -> str:
-    case, columns = result.case, contents_of(result.case).short
+def _short(benchmark: Benchmark, case: Case) -> str:
     grown_on = f", on {case.grown_on}" if case.file or case.puller != DEFAULT else ""
-    columns = tuple(each for each in columns if any(cell != NOTHING for _, cell in rows(result, [each])))
-    heads: Sequence[str] = ["controller", *(column.heading for column in columns)]
-    lines = rows(result, columns)
     if case.tolerance is not None:
-        heads, lines = outcome(result, interval=False)
-    return f"{case.name} ({crystals(len(result.seeds))}){grown_on}\n{_aligned(heads, lines)}"
+        heads, lines = outcome(benchmark, case, interval=False)
+    else:
+        full = rows(benchmark, case, columns := task_of(case).short)
+        told = [0, *(place for place in range(1, len(columns) + 1) if any(line[place] != NOTHING for line in full))]
+        names = ("controller", *(column.heading for column in columns))
+        heads, *lines = (tuple(line[place] for place in told) for line in (names, *full))
+    return f"{case.name} ({crystals(len(benchmark.seeds(case)))}){grown_on}\n{_aligned(heads, lines)}"
 
 
 def _aligned(heads: Sequence[str], lines: Iterable[tuple[str, ...]]) -> str:

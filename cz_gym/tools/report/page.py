@@ -1,11 +1,10 @@
 """Plotly's pictures, one scenario shown at a time: error against pull activity, and signals of its first crystal."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib.resources import files
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,21 +13,19 @@ from plotly.graph_objects import Figure
 from plotly.offline import get_plotlyjs
 from plotly.subplots import make_subplots
 
-from cz_gym.body.signals import TOLERANCE
-from cz_gym.crystal.process import CRYSTAL
 from cz_gym.env import CzEnv
-from cz_gym.evaluation.plots import COLUMNS, GREY, INK, MARKERS, Style, chosen, example, lost, styles_of
+from cz_gym.evaluation.plots import COLUMNS, GREY, INK, MARKERS, styles_of
 from cz_gym.evaluation.protocol import Case
-from cz_gym.evaluation.results import Result
 from cz_gym.evaluation.rollout import Floats
 from cz_gym.evaluation.statistics import Estimate
-from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.support.units import HOUR, MINUTE, MM
+from cz_gym.tools.episodes import Benchmark
+from cz_gym.tools.task_records import Panel, task_of
 
 from . import markdown, tables
-from .crystals import contents_of
-from .figures import floor_of
+from .figures import floor_of, lost
 from .markdown import measured_from
-from .tables import PULL_STEP, RMSE
+from .tables import PULL_STEP, RMSE, chosen
 
 LOG = {"type": "log", "exponentformat": "none"}
 """Logarithmic axis on which plotly writes powers of ten in full, with small digits between them."""
@@ -42,25 +39,26 @@ def plain(name: str) -> str:
     return escape("".join(letter if letter.isprintable() else " " for letter in short), quote=False)
 
 
-def add_menu(figure: go.Figure, results: Sequence[Result], layouts: Sequence[Mapping[str, Any]] = ()) -> None:
+def add_menu(figure: go.Figure, cases: Sequence[Case], layouts: Sequence[Mapping[str, Any]] = ()) -> None:
     """Add a menu that shows the traces of one scenario, with its layout; a trace's meta is its scenario's number."""
     buttons = []
-    for number, result in enumerate(results):
+    for number, case in enumerate(cases):
         arguments: list[Any] = [{"visible": [trace.meta == number for trace in figure.data]}]
         arguments += [dict(layouts[number])] if layouts else []
-        buttons.append({"label": plain(result.case.name), "method": "update", "args": arguments})
+        buttons.append({"label": plain(case.name), "method": "update", "args": arguments})
     figure.for_each_trace(lambda trace: trace.update(visible=trace.meta == 0))
     menu = {"buttons": buttons, "x": 0, "xanchor": "left", "y": 1, "yanchor": "bottom", "pad": {"b": 28}}
-    figure.update_layout(updatemenus=[menu] if len(results) > 1 else [], **(layouts[0] if layouts else {}))
+    figure.update_layout(updatemenus=[menu] if len(cases) > 1 else [], **(layouts[0] if layouts else {}))
 
 
-def pareto(results: Sequence[Result]) -> go.Figure:
+def pareto(benchmark: Benchmark) -> go.Figure:
     """Draw mean RMSE against mean pull step RMS with 95 % intervals; who never moves the pull speed stands leftmost."""
-    figure, styles = go.Figure(), styles_of(results[0].samples)
-    for number, result in enumerate(results):
-        floor = floor_of([result])
-        for name, means in result.means.items():
-            error, activity = means[RMSE.metric], means[PULL_STEP.metric]
+    figure, styles = go.Figure(), styles_of(benchmark.contenders)
+    for number, case in enumerate(benchmark.cases):
+        floor = floor_of(benchmark.only([case]))
+        for name in (each.name for each in benchmark.contenders):
+            estimates: Any = (benchmark.get(case, name, column.metric) for column in (RMSE, PULL_STEP))
+            error, activity = estimates
             still, style = activity.mean < floor, styles[name]
             figure.add_scatter(
                 name=plain(name),
@@ -80,7 +78,7 @@ def pareto(results: Sequence[Result]) -> go.Figure:
     figure.update_layout(
         height=560, legend={"orientation": "h", "y": 0, "yref": "container", "yanchor": "bottom"}, showlegend=True
     )
-    add_menu(figure, results)
+    add_menu(figure, benchmark.cases)
     return figure
 
 
@@ -95,118 +93,69 @@ OUTLIERS = 0.001
 """Share of the values at either end that may lie outside a panel's range [-]."""
 
 
-class Panel(NamedTuple):
-    """Lines over time that share an axis."""
-
-    title: str
-    unit: str
-    scale: float
-    """Size of the unit in SI units."""
-    lines: Mapping[str, Callable[[Any, float], Floats]]
-    """Lines by name, each a function of an episode's signals and the operator's bias [m], in SI units. "true" and
-    "camera" (its reading) are drawn for each controller; other lines are the same for all and drawn once."""
-    levels: tuple[float, ...] = ()
-    """Values that are marked [unit]."""
-
-
-PANELS = (
-    Panel(
-        "radius error", "mm", MM,
-        {"camera": lambda s, bias: s.r_br_measured - bias - s.r_ref, "true": lambda s, bias: s.r_c - s.r_ref},
-        (-TOLERANCE / MM, 0.0, TOLERANCE / MM),
-    ),
-    Panel(
-        "bright ring less radius", "mm", MM,
-        {
-            "camera": lambda s, bias: s.r_br_measured - bias - s.r_c,
-            "true": lambda s, bias: s.r_br - bias - s.r_c,
-            "hidden offset": lambda s, bias: s.ring_offset,
-        },
-        (0.0,),
-    ),
-    Panel("pull speed", "mm/min", MM_PER_MIN, {"true": lambda s, bias: s.v_p}),
-    Panel("growth rate", "mm/min", MM_PER_MIN, {"true": lambda s, bias: s.v_g}),
-    Panel("heater power", "kW", KILO, {"true": lambda s, bias: s.Q_H}),
-    Panel("heater temperature", "K", 1.0, {"true": lambda s, bias: s.T_1, "recipe": lambda s, bias: s.T_1_ref}),
-    Panel("melt temperature", "K", 1.0, {"true": lambda s, bias: s.T_b}),
-    Panel("meniscus height", "mm", MM, {"true": lambda s, bias: s.h_c}),
-    Panel("growth angle", "deg", np.pi / 180.0, {"true": lambda s, bias: s.alpha_c}, (0.0,)),
-)  # fmt: skip
-_RECIPES: dict[str, Callable[[Any, float], Floats]] = {
-    "pull speed": lambda s, bias: s.v_p_ref,
-    "heater power": lambda s, bias: s.Q_H_ref,
-    "meniscus height": lambda s, bias: s.h_ref,
-}
-CRYSTAL_PANELS = (
-    PANELS[0]._replace(lines={"true": PANELS[0].lines["true"]}),
-    PANELS[1]._replace(levels=()),
-    *(each._replace(lines={**each.lines, "recipe": line} if (line := _RECIPES.get(each.title)) else each.lines)
-      for each in PANELS[2:]),
-    Panel("v/G by the recipe's", "1", 1.0, {"true": lambda s, bias: s.v_over_G}, (1.0,)),
-)  # fmt: skip
-"""Panels of a whole crystal, against its length; the ring is not where the recipe's ring is while the radius is off."""
 OWN = ("true", "camera")
 """Lines that are drawn for each controller."""
 
 
-def crystal(results: Sequence[Result]) -> go.Figure:
+def crystal(benchmark: Benchmark) -> go.Figure:
     """Draw the first crystal of each scenario, one scenario at a time, under the controllers of :func:`chosen`."""
-    whole = results[0].case.process == CRYSTAL
-    panels = CRYSTAL_PANELS if whole else PANELS
+    task, config = task_of(benchmark.cases[0]), benchmark.cases[0].config()
+    panels = task.panels
     titles = [f"{panel.title} [{panel.unit}]" for panel in panels]
     figure = make_subplots(len(panels), 1, shared_xaxes=True, vertical_spacing=0.02, subplot_titles=titles)
-    styles = styles_of(results[0].samples)
-    layouts = [_draw(figure, number, result, styles, panels) for number, result in enumerate(results)]
+    layouts = [_draw(figure, number, benchmark, case) for number, case in enumerate(benchmark.cases)]
     for row, panel in enumerate(panels, 1):
         for level in panel.levels:
             line = {"color": GREY, "width": 1, "dash": "dot"}
             figure.add_hline(level, row=row, col=1, line=line, layer="below")
-    if not whole:
-        figure.update_xaxes(range=[0.0, results[0].case.config().horizon / MINUTE])
+    if not task.by_length:
+        figure.update_xaxes(range=[0.0, config.horizon / MINUTE])
     figure.update_xaxes(hoverformat=".2f", nticks=10)
-    figure.update_xaxes(title="length [mm]" if whole else "time [min]", row=len(panels), col=1)
+    figure.update_xaxes(title="length [mm]" if task.by_length else "time [min]", row=len(panels), col=1)
     legend = {"orientation": "h", "y": -0.04, "yanchor": "top", "groupclick": "togglegroup"}
     figure.update_layout(legend=legend, height=150 * len(panels), hovermode="x")
-    add_menu(figure, results, layouts)
+    add_menu(figure, benchmark.cases, layouts)
     return figure
 
 
-def _draw(
-    figure: go.Figure, scenario: int, result: Result, styles: Mapping[str, Style], panels: Sequence[Panel]
-) -> dict[str, Any]:
+def _draw(figure: go.Figure, scenario: int, benchmark: Benchmark, case: Case) -> dict[str, Any]:
     """Add the lines of a scenario and return the ranges of its panels: those of the crystals that were not lost."""
-    samples, interval = chosen(result.samples, COLUMNS), result.case.control_interval
-    by_length = result.case.process == CRYSTAL
-    bias = 0.0 if by_length else ring_bias(result.case, result.seeds[0])
-    step = max(round(POINT / interval), 1)
-    time = {"x0": 0.5 * step * interval / MINUTE, "dx": step * interval / MINUTE}
-    longest = max(map(example, samples), key=lambda signals: len(signals.r_c))
-    whole = [sample.name for sample in samples if not lost(sample)] or [sample.name for sample in samples]
+    task, styles = task_of(case), styles_of(benchmark.contenders)
+    names = [each.name for each in chosen(benchmark, case, COLUMNS)]
+    fates = {name: lost(benchmark, case, name) for name in names}
+    signals = {name: benchmark.signals[case.name, name] for name in names}
+    longest = max(signals.values(), key=lambda each: len(each.r_c))
+    bias = 0.0 if task.by_length else ring_bias(case, benchmark.seeds(case)[0])
+    step = max(round(POINT / case.control_interval), 1)
+    minutes = step * case.control_interval / MINUTE
     layout: dict[str, Any] = {}
-    for number, panel in enumerate(panels):
+    for number, panel in enumerate(task.panels):
         ends = list(panel.levels)
-        for name, function in panel.lines.items():
-            for sample in samples if name in OWN else samples[:1]:
-                own = name in OWN
-                signals = example(sample) if own else longest
-                values = _points(function(signals, bias) / panel.scale, step)
-                places = {"x": _points(signals.L / MM, step)[: len(values)]} if by_length else time
-                look = {"name": plain(sample.name) if own else name, "showlegend": False}
-                if own and not number and name == "true":
-                    rmse = f"{sample.metric('rmse_mm')[0, 0]:.3f} mm{', lost' if lost(sample) else ''}"
-                    look = {"name": f"{look['name']}: {rmse}", "showlegend": True}
-                style = styles[sample.name]
-                line = {"color": style.colour if own else INK, "width": 0.8 if name == "camera" else 1.5}
-                figure.add_scatter(
-                    row=number + 1, col=1, y=values, **places, **look, mode="lines",
-                    line={**line, "dash": "solid" if own else "dash"}, opacity=0.35 if name == "camera" else 1.0,
-                    legendgroup=sample.name if own else name, meta=scenario,
-                )  # fmt: skip
-                if len(values) and (not own or sample.name in whole):
-                    ends += np.quantile(values, [OUTLIERS, 1.0 - OUTLIERS]).tolist()
+        for line, name, own in _lines(panel, names):
+            logged = signals[name] if own else longest
+            values = _points(panel.lines[line](logged, bias) / panel.scale, step)
+            places = {"x0": 0.5 * minutes, "dx": minutes}
+            look = {"name": plain(name) if own else line, "showlegend": False}
+            if own and not number and line == "true":
+                rmse = f"{benchmark.values(case, name, RMSE.metric)[0, 0]:.3f} mm{', lost' * fates[name]}"
+                look = {"name": f"{look['name']}: {rmse}", "showlegend": True}
+            colour, camera = styles[name].colour if own else INK, line == "camera"
+            figure.add_scatter(
+                row=number + 1, col=1, y=values, mode="lines", **look,
+                **({"x": _points(logged.L / MM, step)[: len(values)]} if task.by_length else places),
+                line={"color": colour, "width": 0.8 if camera else 1.5, "dash": "solid" if own else "dash"},
+                opacity=0.35 if camera else 1.0, legendgroup=name if own else line, meta=scenario,
+            )  # fmt: skip
+            if len(values) and not (own and fates[name] and not all(fates.values())):
+                ends += np.quantile(values, [OUTLIERS, 1.0 - OUTLIERS]).tolist()
         margin = max(0.08 * (max(ends) - min(ends)), 1e-3)
         layout[f"yaxis{number + 1 if number else ''}.range"] = [min(ends) - margin, max(ends) + margin]
     return layout
+
+
+def _lines(panel: Panel, names: Sequence[str]) -> list[tuple[str, str, bool]]:
+    """Lines of a panel: name, controller, and whether each controller has one; else it is drawn once."""
+    return [(line, name, line in OWN) for line in panel.lines for name in (names if line in OWN else names[:1])]
 
 
 def _points(values: Floats, step: int) -> npt.NDArray[np.float32]:
@@ -240,14 +189,12 @@ ANSWER_NOTE = (
 _SLOT = re.compile(r"<!-- slot:(\w+) -->")
 
 
-def page(results: Sequence[Result], command: str) -> str:
+def page(benchmark: Benchmark, command: str) -> str:
     """Return the page; the same results give the same text."""
-    case, samples, shown = results[0].case, results[0].samples, contents_of(results[0].case)
-    verdict = shown.verdict(results)
-    config, most = case.config(), max(len(result.seeds) for result in results)
-    counted = tables.deciding(results)
-    best = replace(counted[0], samples=tuple(tables.best_of_each_kind(counted)))
-    heads, groups = shown.overview([best, *counted[1:]])
+    case, contenders, task = benchmark.cases[0], benchmark.contenders, task_of(benchmark.cases[0])
+    verdict, config = task.verdict(benchmark), case.config()
+    most = max(len(benchmark.seeds(each)) for each in benchmark.cases)
+    heads, groups = task.overview(benchmark.only(tables.deciding(benchmark), tables.best_of_each_kind(benchmark)))
     parts = {
         "style": _asset("page.css"),
         "plotly": get_plotlyjs(),
@@ -257,30 +204,32 @@ def page(results: Sequence[Result], command: str) -> str:
         "question": "Who holds the radius best",
         "answer_note": ANSWER_NOTE,
         "limit": f"{config.radius_limit / MM:.3g}",
-        "lede": f"{tables.count(len(samples), 'controller')}, {tables.count(len(results), 'scenario')}, "
+        "lede": f"{tables.count(len(contenders), 'controller')}, {tables.count(len(benchmark.cases), 'scenario')}, "
         f"up to {tables.crystals(most)} each, the same for everyone: at most {config.horizon / HOUR:.3g} h at one "
         f"action every {config.control_interval:g} s, on {case.grown_on}.",
         "scenarios": _table(verdict.heads, verdict.rows) if verdict.rows else "",
-        "tables": "\n".join(_metrics(result, is_open=result is results[0]) for result in results),
-        "pareto": _html(pareto(results), "pareto"),
-        "crystal": _html(crystal(results), "crystal"),
-        "controllers": _table(tables.WHO, tables.who(samples), "words"),
+        "tables": "\n".join(_metrics(benchmark, each, is_open=each is case) for each in benchmark.cases),
+        "pareto": _html(pareto(benchmark), "pareto"),
+        "crystal": _html(crystal(benchmark), "crystal"),
+        "controllers": _table(tables.WHO, tables.who(contenders), "words"),
         "command": escape(command),
     }
     if case.tolerance is not None:
-        parts |= _for_a_grower(results)
+        parts |= _for_a_grower(benchmark)
     return _SLOT.sub(lambda slot: parts[slot[1]], _asset("page.html"))
 
 
-def _for_a_grower(results: Sequence[Result]) -> dict[str, str]:
+def _for_a_grower(benchmark: Benchmark) -> dict[str, str]:
     """The parts of the page that differ on a puller."""
-    tables_of = (f"<h3>{escape(result.case.name)}</h3>{_table(*markdown.outcome(result))}" for result in results)
+    tables_of = (
+        f"<h3>{escape(case.name)}</h3>{_table(*markdown.outcome(benchmark, case))}" for case in benchmark.cases
+    )
     return {
-        "verdict": escape(markdown.recommendation(results)),
-        "best": f"<h2>{escape(markdown.title(results[0].case))}</h2>{''.join(tables_of)}",
+        "verdict": escape(markdown.recommendation(benchmark)),
+        "best": f"<h2>{escape(markdown.title(benchmark.cases[0]))}</h2>{''.join(tables_of)}",
         "best_note": escape(markdown.EXPLAINED),
         "question": "What the loops bear",
-        "scenarios": _table(markdown.MARGINS, markdown.margins(results[0].samples, results[0])),
+        "scenarios": _table(markdown.MARGINS, markdown.margins(benchmark)),
         "answer_note": escape(markdown.MARGINS_EXPLAINED),
     }
 
@@ -294,19 +243,20 @@ def _html(figure: Figure, name: str) -> str:
     return text.replace("<script>", '<script type="text/plain">')
 
 
-def _metrics(result: Result, is_open: bool) -> str:
+def _metrics(benchmark: Benchmark, case: Case, is_open: bool) -> str:
     """Every metric of a scenario, the lowest RMSE first, to unfold."""
-    error, drives = contents_of(result.case).columns
-    columns = (*error, *tables.comparison(result), *drives)
-    ranked = sorted(result.samples, key=lambda sample: result.means[sample.name][tables.RMSE.metric].mean)
+    error, drives = task_of(case).columns
+    columns = (*error, *tables.comparison(benchmark, case), *drives)
+    ranked = sorted(benchmark.contenders, key=lambda each: benchmark.mean(case, each.name, RMSE.metric))
     heads = "controller", *(column.heading for column in columns)
-    rows = tables.rows(replace(result, samples=tuple(ranked)), columns)
-    marks = (" [bound]" * sample.contender.bound for sample in ranked)
+    rows = tables.rows(benchmark.only(contenders=ranked), case, columns)
+    marks = (" [bound]" * each.bound for each in ranked)
     marked = [(f"{name}{mark}", *cells) for mark, (name, *cells) in zip(marks, rows, strict=True)]
-    about = escape(f"{result.case.meaning}. {measured_from(result).replace('`', '')}")
+    about = escape(f"{case.meaning}. {measured_from(benchmark, case).replace('`', '')}")
     return (
-        f"<details{' open' if is_open else ''}><summary>{escape(result.case.name)} "
-        f'({tables.crystals(len(result.seeds))})</summary><p class="note">{about}</p>{_table(heads, marked)}</details>'
+        f"<details{' open' if is_open else ''}><summary>{escape(case.name)} "
+        f'({tables.crystals(len(benchmark.seeds(case)))})</summary><p class="note">{about}</p>'
+        f"{_table(heads, marked)}</details>"
     )
 
 

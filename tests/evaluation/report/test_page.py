@@ -11,9 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cz_gym.tools import benchmark
-from cz_gym.tools.report.page import PANELS, crystal, page, pareto, plain
-from cz_gym.tools.report.tables import DRIVES, ERROR, comparison, overview
-from tests.samples import result_of
+from cz_gym.tools.report.page import crystal, page, pareto, plain
+from cz_gym.tools.report.tables import comparison
+from cz_gym.tools.task_records import BODY_DRIVES, BODY_ERROR, PANELS, body_overview
+from tests.samples import joined, result_of
 
 EVIL = "</script><img src=x onerror=alert(1)>\"'&amp;<b>\u2028%{x}|"
 ROWS, NAMES = ("puller", "reference-b"), ("open-loop", "paper", "pid-conventional")
@@ -26,7 +27,8 @@ class Made:
     one crystal less."""
 
     def __init__(self):
-        self.results, runs = zip(*(result_of(name, NAMES, EVIL, (4, 7), fewer=1) for name in ROWS), strict=True)
+        parts, runs = zip(*(result_of(name, NAMES, EVIL, (4, 7), fewer=1) for name in ROWS), strict=True)
+        self.results = joined(parts)
         self.runs = dict(zip(ROWS, runs, strict=True))
         self.text = page_of(self.results)
         self.elements = BeautifulSoup(self.text, "html.parser").find_all()
@@ -68,30 +70,32 @@ def made():
 def test_the_tables_are_the_results(made):
     """Every metric has a column with a unit; the lowest RMSE stands first."""
     rows = iter(made.rows)
-    heads, groups = overview(made.results[:1])
+    heads, groups = body_overview(made.results.only(made.results.cases[:1]))
     assert next(rows) == [heads[0], *map(together, heads[1:])]
     for line in (next(rows), next(rows)):
         kind = "learned from the reward" if line[0].startswith(EVIL) else "classical"
         name, *cells = next(each for each in groups[kind] if line[0].startswith(each[0]))
         assert line == [f"{name}[{kind}]", *map(together, cells)]
-    for result in made.results:
-        columns = (*ERROR, *comparison(result), *DRIVES)
-        assert {column.metric for column in columns} == {*result.means["paper"]}
+    known = made.results.estimates
+    for case in made.results.cases:
+        columns = (*BODY_ERROR, *comparison(made.results, case), *BODY_DRIVES)
+        assert {column.metric for column in columns} == {*known.loc[known["kind"] == "mean", "metric"]}
         without = [c.heading for c in columns if "[" not in c.heading and "probability" not in c.heading]
         assert without == ["cost", "return"]
         assert next(rows) == ["controller", *(together(column.heading) for column in columns)]
-        for name in sorted(result.means, key=lambda name: result.means[name]["rmse_mm"].mean):
+        who = [each.name for each in made.results.contenders]
+        for name in sorted(who, key=lambda name, case=case: made.results.mean(case, name, "rmse_mm")):
             head, *cells = next(rows)
             assert head.startswith(name)
-            assert cells == [together(column.text(column.estimate(result, name))) for column in columns]
+            assert cells == [together(column.of(made.results, case, name)) for column in columns]
 
 
 def test_pictures_are_the_results_of_the_chosen_scenario(made):
-    for scenario, result in enumerate(made.results):
-        for point, sample in zip(visible(made.figures[0], scenario), result.samples, strict=True):
-            error = result.means[sample.name]["rmse_mm"]
+    for scenario, case in enumerate(made.results.cases):
+        for point, who in zip(visible(made.figures[0], scenario), made.results.contenders, strict=True):
+            error = made.results.get(case, who.name, "rmse_mm")
             low, high = error.ends
-            assert point.name == plain(sample.name)
+            assert point.name == plain(who.name)
             assert point.y == (error.mean,)
             ends = point.y[0] - point.error_y.arrayminus[0], point.y[0] + point.error_y.array[0]
             assert ends == pytest.approx((low, high))
@@ -117,13 +121,12 @@ def test_lines_are_means_of_the_rollouts_over_45_seconds(made, row):
 
 
 def test_a_signal_that_is_no_number_ends_the_line(made):
-    result = made.results[1]
-    first, *others = result.samples
-    assert first.example
-    r_br = first.example.r_br.copy()
+    key = ROWS[1], "open-loop"
+    logged = made.results.signals[key]
+    r_br = logged.r_br.copy()
     r_br[100:] = np.nan
-    broken = replace(first, example=first.example._replace(r_br=r_br))
-    drawn = crystal([replace(result, samples=(broken, *others))])
+    signals = {**made.results.signals, key: logged._replace(r_br=r_br)}
+    drawn = crystal(replace(made.results, signals=signals).only(made.results.cases[1:]))
     lengths = {len(t.y) for t in drawn.data if t.legendgroup == "open-loop" and t.yaxis == "y2"}
     assert lengths == {100 // STEP, 2160 // STEP}, "the camera goes on"
 

@@ -3,17 +3,26 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import numpy as np
+import pandas as pd
 
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.evaluation.protocol import Case
-from cz_gym.evaluation.results import Result, Sample
 from cz_gym.evaluation.statistics import Estimate
-from cz_gym.tools.report import crystals, tables
-from cz_gym.tools.report.tables import FEWEST, best_of_each_kind, verdict
-from tests.samples import contender
+from cz_gym.tools import task_records
+from cz_gym.tools.episodes import ESTIMATES
+from cz_gym.tools.report import tables
+from cz_gym.tools.report.tables import FEWEST, best_of_each_kind
+from cz_gym.tools.task_records import body_verdict as verdict
+from cz_gym.tools.task_records import crystal_verdict
+from tests import samples
+from tests.samples import contender, joined
 
 BETTER, WORSE, EITHER = Estimate(-1.0, (-2.0, -0.5), 9), Estimate(1.0, (0.5, 2.0), 9), Estimate(0.1, (-1.0, 1.0), 9)
+
+
+def line(case, name, kind, estimate, against="", metric="rmse_mm"):
+    low, high = estimate.ci95 or (float("nan"),) * 2
+    return case, name, metric, kind, against, estimate.mean, low, high, estimate.n
 
 
 def made(**scenarios):
@@ -21,19 +30,22 @@ def made(**scenarios):
 
     The rival has an RMSE of 5 mm; b knew the plant in training.
     """
-    results = []
+    parts, lines = [], []
+    who = [contender("lqg"), *(contender(agent, training_seeds=(0,)) for agent in "abc")]
+    who[2].trained[0].contract.learned_from = "plant"
+    most = max(map(len, scenarios.values()))
     for name, differences in scenarios.items():
-        verdicts = dict(zip("abc", differences, strict=False))
-        seeds = (0,) if name.startswith("single") else tuple(range(FEWEST))
-        who = [contender("lqg"), *(contender(agent, training_seeds=(0,)) for agent in verdicts)]
-        for each in who[2:3]:
-            each.trained[0].contract.learned_from = "plant"
-        samples = tuple(Sample(each, seeds, np.zeros((1, 1, 1)), 0.0) for each in who)
-        means = {"lqg": {"rmse_mm": Estimate(5.0, (4.0, 6.0), 9)}}
-        means |= {agent: {"rmse_mm": Estimate(5.0 + each.mean, None, 9)} for agent, each in verdicts.items()}
-        case = Case(name, "nominal" if len(seeds) == 1 else "randomized", "")
-        results.append(Result(case, samples, means, {}, {}, {}, {}, "lqg", verdicts))
-    return results
+        crystals = 1 if name.startswith("single") else FEWEST
+        case = Case(name, "nominal" if crystals == 1 else "randomized", "")
+        parts.append(samples.made(case, *((each, {"rmse_mm": [0.0] * crystals}) for each in who[: most + 1])))
+        lines.append(line(name, "lqg", "mean", Estimate(5.0, (4.0, 6.0), 9)))
+        for agent, each in zip("abc", differences, strict=False):
+            lines.append(line(name, agent, "mean", Estimate(5.0 + each.mean, None, 9)))
+            lines.append(line(name, agent, "verdict", each, "lqg"))
+        for agent in "abc"[len(differences) : most]:  # the last difference is that of the others
+            lines.append(line(name, agent, "mean", Estimate(5.0 + differences[-1].mean, None, 9)))
+            lines.append(line(name, agent, "verdict", differences[-1], "lqg"))
+    return replace(joined(parts), estimates=pd.DataFrame(lines, columns=[*ESTIMATES]))
 
 
 def test_the_sentence_says_which_kind_holds_the_radius_best_and_where():
@@ -66,7 +78,7 @@ def test_the_table_has_a_row_a_scenario_with_the_best_of_each_kind():
         ("two", rival, "c 4.000", better, "b 6.000", worse, "c"),
         ("three", rival, "a 6.000", worse, "b 5.100", either, "no difference shown"),
     )
-    assert [sample.name for sample in best_of_each_kind(results)] == ["lqg", "b", "c"]
+    assert [each.name for each in best_of_each_kind(results)] == ["lqg", "b", "c"]
 
 
 def test_a_single_crystal_does_not_count_beside_others():
@@ -75,35 +87,32 @@ def test_a_single_crystal_does_not_count_beside_others():
 
 
 def test_there_is_no_verdict_on_a_few_crystals_or_of_one_kind_alone(monkeypatch):
-    (nobody,) = made(one=[])
+    nobody, case = made(one=[]), Case("one", "randomized", "")
     alone = "No learned agent took part in this run."
-    assert verdict([nobody]) == (alone, (), ())
-    seer = replace(nobody.samples[0], contender=contender("a", training_seeds=(0,), privileged=True))
-    assert verdict([replace(nobody, samples=(seer,))]) == (alone, (), ())
-    agent = replace(seer, contender=contender("b", training_seeds=(0,)))
-    only = replace(nobody, samples=(agent,), rival=None)
-    assert verdict([only]).sentence.startswith("No classical controller took part")
+    assert verdict(nobody) == (alone, (), ())
+    seer = contender("a", training_seeds=(0,), privileged=True)
+    assert verdict(samples.made(case, (seer, {"rmse_mm": [0.0] * FEWEST}))) == (alone, (), ())
+    agent = contender("b", training_seeds=(0,))
+    only = samples.made(case, (agent, {"rmse_mm": [0.0] * FEWEST}))
+    assert verdict(only).sentence.startswith("No classical controller took part")
     monkeypatch.setattr(tables, "FEWEST", FEWEST + 1)
     assert verdict(made(one=[BETTER])) == ("No verdict: 20 crystals, and a verdict needs at least 21.", (), ())
-    one = replace(made(single=[BETTER])[0], case=Case("one", "randomized", ""))
-    assert verdict([one]).sentence.startswith("No verdict: 1 crystal, ")
+    one = samples.made(case, (contender("lqg"), {"rmse_mm": [0.0]}), (agent, {"rmse_mm": [0.0]}))
+    assert verdict(one).sentence.startswith("No verdict: 1 crystal, ")
 
 
 def test_controllers_that_lose_equally_few_crystals_are_named_together(monkeypatch):
-    case, names = Case("crown", "randomized", "", process=CRYSTAL, stage="crown"), ("a", "b", "c", "d")
-    samples = tuple(Sample(contender(name), tuple(range(FEWEST)), np.zeros((1, 1, 1)), 0.0) for name in names)
-    losses = zip(names, (0.1, 0.0, 0.0, 0.0), (1.0, 3.0, 2.0, 4.0), strict=True)
-    means = {
-        name: {"failure_rate": Estimate(lost, None, 9), "rmse_mm": Estimate(rmse, None, 9)}
-        for name, lost, rmse in losses
-    }
-    result = Result(case, samples, means, {}, {}, {}, {}, None, {})
-    monkeypatch.setattr(crystals, "_plain", lambda column, result, name: f"{name}'s")
-    assert crystals.verdict([result]).sentence.startswith(
+    case = Case("crown", "randomized", "", process=CRYSTAL, stage="crown")
+    losses = zip("abcd", (0.1, 0.0, 0.0, 0.0), (1.0, 3.0, 2.0, 4.0), strict=True)
+    figures = [
+        (contender(name), {"failure_rate": [lost] * FEWEST, "rmse_mm": [rmse] * FEWEST}) for name, lost, rmse in losses
+    ]
+    monkeypatch.setattr(task_records, "_plain", lambda column, benchmark, case, name: f"{name}'s")
+    assert crystal_verdict(samples.made(case, *figures)).sentence.startswith(
         "b, c and d lose the fewest crystals; of them c, which loses c's % of crown, has the least error in the crown; "
     )
-    few = replace(result, samples=tuple(replace(each, seeds=each.seeds[:1]) for each in samples))
-    assert crystals.verdict([few]).sentence.startswith("No verdict: 1 crystal, ")
+    few = [(who, {name: each[:1] for name, each in values.items()}) for who, values in figures]
+    assert crystal_verdict(samples.made(case, *few)).sentence.startswith("No verdict: 1 crystal, ")
 
 
 def test_an_agent_stands_with_those_that_were_told_as_much_as_the_most_told_of_its_training_seeds():
