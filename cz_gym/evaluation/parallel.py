@@ -19,12 +19,13 @@ from cz_gym.engine.batch import processors
 from cz_gym.support.errors import CzError
 
 WAIT = 1.0
-"""Longest time between two calls of :data:`Look` [s], a function that is called while tasks run."""
-Look = Callable[[], None]
+"""Longest time between two calls of :data:`PollProgress` [s]."""
+PollProgress = Callable[[], None]
+"""A function that is called while tasks run, to show their progress."""
 
 
 def run_tasks(
-    executor: Executor, function: Callable[[Any], Any], tasks: Sequence[Any], look: Look | None = None
+    executor: Executor, function: Callable[[Any], Any], tasks: Sequence[Any], poll_progress: PollProgress | None = None
 ) -> Iterator[tuple[int, Any]]:
     """Run ``function`` on every task by an executor; yields the number of a task and its result, as they come.
 
@@ -35,12 +36,15 @@ def run_tasks(
     while numbers:
         for each in wait(numbers, WAIT, FIRST_COMPLETED).done:
             yield numbers.pop(each), each.result()
-        if look:
-            look()
+        if poll_progress:
+            poll_progress()
 
 
 def in_processes(
-    function: Callable[[Any], Any], tasks: Sequence[Any], look: Look | None = None, processes: int | None = None
+    function: Callable[[Any], Any],
+    tasks: Sequence[Any],
+    poll_progress: PollProgress | None = None,
+    processes: int | None = None,
 ) -> Iterator[tuple[int, Any]]:
     """Run tasks as :func:`run_tasks` does, in a pool of processes (None: one a processor) that ends with its caller."""
     # Forking would copy the threads of torch and of the native batch in unknown states.
@@ -49,7 +53,7 @@ def in_processes(
     workers = max(min(processes or processors(), len(tasks)), 1)
     pool = ProcessPoolExecutor(workers, context, initializer=_end_with, initargs=(parent_pipe,))
     try:
-        yield from run_tasks(pool, function, tasks, look)
+        yield from run_tasks(pool, function, tasks, poll_progress)
         pool.shutdown()
     except BrokenProcessPool:
         raise CzError("a process was killed: is there enough memory?") from None
@@ -61,7 +65,7 @@ def in_processes(
 def run_parallel(
     function: Callable[[Any], Any],
     tasks: Sequence[Any],
-    look: Look | None = None,
+    poll_progress: PollProgress | None = None,
     cluster: str | None = None,
     shared: Path | None = None,
     processes: int | None = None,
@@ -71,15 +75,14 @@ def run_parallel(
     ``shared`` is the folder that tasks write into.
     """
     if not cluster:
-        yield from in_processes(function, tasks, look, processes)
+        yield from in_processes(function, tasks, poll_progress, processes)
     elif tasks:
-        on_cluster = import_module("cz_gym.evaluation.parallel").on_cluster
-        yield from on_cluster(cluster, function, tasks, look, shared)
+        yield from on_cluster(cluster, function, tasks, poll_progress, shared)
 
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Ctrl-C waits till the end, and never comes to processes that start here: their imports would show a traceback."""
+    """Postpone Ctrl-C to the end of the block; processes that start in it ignore it."""
     mask: Any = getattr(signal, "pthread_sigmask", lambda *_: None)  # Windows has none
     before = mask(getattr(signal, "SIG_BLOCK", 0), {signal.SIGINT})
     try:
@@ -89,7 +92,7 @@ def _uninterrupted() -> Iterator[None]:
 
 
 def _end_with(parent_pipe: Any) -> None:
-    """In a process of a pool: leave Ctrl-C to the caller, and end when the other end of the pipe is closed."""
+    """Set up a worker process: it ignores Ctrl-C, and ends when the caller's end of the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def follow() -> None:
@@ -112,13 +115,13 @@ Versions = dict[str, str]
 
 @cache
 def versions() -> Versions:
-    """Versions of what numbers depend on, in this process."""
+    """Return the versions of what numbers depend on, in this process."""
     packages = {name: str(import_module(name).__version__) for name in COMPUTING}
     return {"python": platform.python_version(), **packages, "plant_hash": make_config().plant_hash}
 
 
 class OnWorker:
-    """A function as a worker runs it: not before the worker's versions are those of the process that asks."""
+    """A function that a worker runs only if its versions are those of the process that asks."""
 
     def __init__(self, function: Callable[[Any], Any]) -> None:
         self.function, self.asked = function, versions()
@@ -130,14 +133,18 @@ class OnWorker:
 
 
 def check_versions(where: str, own: Versions, asked: Versions) -> None:
-    """Raise CzError that names every version of a worker that is not the one asked for."""
+    """Raise CzError, which names every version of a worker that is not the one asked for."""
     differ = [f"{name} {own.get(name)}, here {asked[name]}" for name in asked if own.get(name) != asked[name]]
     if differ:
         raise CzError(f"worker {where} has other versions, so its numbers would differ: {'; '.join(differ)}")
 
 
 def on_cluster(
-    address: str, function: Callable[[Any], Any], tasks: Any, look: Any = None, shared: Path | None = None
+    address: str,
+    function: Callable[[Any], Any],
+    tasks: Any,
+    poll_progress: PollProgress | None = None,
+    shared: Path | None = None,
 ) -> Iterator[tuple[int, Any]]:
     """Run tasks as :func:`run_tasks` does, on the workers of the scheduler at ``address``, tcp://HOST:8786.
 
@@ -149,7 +156,7 @@ def on_cluster(
         _check_workers(client, shared)
         executor = client.get_executor(pure=False)
         try:
-            yield from run_tasks(executor, OnWorker(function), tasks, look)
+            yield from run_tasks(executor, OnWorker(function), tasks, poll_progress)
         except distributed.scheduler.KilledWorker:
             raise CzError("a task has ended one worker after the other: is there enough memory?") from None
         finally:
@@ -158,7 +165,7 @@ def on_cluster(
 
 @contextmanager
 def _client(distributed: Any, address: str) -> Iterator[Any]:
-    """A client of the scheduler; CzError if none answers, or no worker comes."""
+    """Connect to the scheduler; CzError if none answers, or no worker comes."""
     try:
         client = distributed.Client(address, timeout=ANSWER, set_as_default=False)
     except (OSError, ValueError) as error:

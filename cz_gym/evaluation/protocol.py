@@ -68,17 +68,17 @@ class Contender:
 
     @property
     def learned(self) -> bool:
-        """Whether it was trained."""
+        """True if it was trained."""
         return bool(self.training_seeds)
 
     @property
     def bound(self) -> bool:
-        """Whether it is a bound on controllers: it knows or reads something that no sensor shows."""
+        """True for a bound on controllers, which knows or reads something that no sensor shows."""
         return self.privileged or self.observation == "state"
 
     @property
     def knows(self) -> str:
-        """Heading of its group in tables, by its knowledge of the plant."""
+        """Heading of the contender's group in tables, by its knowledge of the plant."""
         if self.bound:
             return "bounds, told what no sensor shows"
         if not self.learned:
@@ -87,12 +87,12 @@ class Contender:
         return next((group for source, group in reversed(GROUPS.items()) if source in sources), GROUPS[REWARD])
 
     def policies(self, config: Config) -> tuple[Any, ...]:
-        """Its policy for an environment's settings; of an agent one a training seed."""
+        """Return the policy for an environment's settings; of an agent one a training seed."""
         return self.trained or (self.make(config),)
 
 
 def agent(name: str, policies: Sequence[Any], own: bool = False) -> Contender:
-    """An agent, the user's ``own`` if it was given as a file, from its policies, one a training seed.
+    """Make the contender of an agent, the user's ``own`` if given as a file, from its policies, one a training seed.
 
     Raises CzError if the policies are not training seeds of one agent.
     """
@@ -114,7 +114,7 @@ def agent(name: str, policies: Sequence[Any], own: bool = False) -> Contender:
 
 
 def unchanged(policy: Any, config: Config) -> Any:
-    """The policy, whatever the environment is."""
+    """Return the policy, whatever the environment is."""
     return policy
 
 
@@ -188,7 +188,7 @@ class Case:
 
     @property
     def deterministic(self) -> bool:
-        """Whether all its crystals are the same."""
+        """True if all crystals are the same."""
         return find_scenario(self.scenario).deterministic
 
     def seeds(self, episodes: int) -> range:

@@ -71,14 +71,14 @@ class Maker:
 
     @classmethod
     def of(cls, place: str) -> Self:
-        """The maker of a place; CzError if nothing there can be one."""
+        """Return the maker of a place; CzError if nothing there can be one."""
         return cls(str(Path(place).absolute()), load(place, "controller", _controls)[1])
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self).of, (self.place,)
 
     def __call__(self, config: Config) -> Any:
-        """The controller for an environment; a class or function gets what it names of its settings."""
+        """Make the controller for an environment; a class or function gets the settings that it names."""
         if hasattr(self.source, "predict") and not inspect.isclass(self.source):
             return self.source
         given = {"config": config, "control_interval": config.control_interval}
@@ -101,7 +101,7 @@ def controller(place: str) -> Contender:
 
 
 def _controls(value: Any, module: str) -> bool:
-    """Whether it is a controller, or a class or function of that module that makes one."""
+    """Return whether a value is a controller, or a class or function of that module that makes one."""
     own = getattr(value, "__module__", "") == module
     acts = hasattr(value, "predict") and (own or not inspect.isclass(value))
     return acts or (own and inspect.isfunction(value))

@@ -13,7 +13,7 @@ from .errors import CzError
 
 OPTIONAL = (
     "aiohttp", "array_api_compat", "asyncua", "blark", "casadi", "control", "cryptography", "distributed", "envpool",
-    "filelock", "fmpy", "h5py", "joblib", "matplotlib", "minari", "onnx", "onnxruntime", "pandas", "pillow",
+    "filelock", "fmpy", "h5py", "matplotlib", "minari", "onnx", "onnxruntime", "pandas", "pillow",
     "plotly", "pyarrow", "pygame", "pythonfmu", "sb3_contrib", "selenium", "stable_baselines3", "tensorboard", "torch",
     "torchrl", "tqdm",
 )  # fmt: skip

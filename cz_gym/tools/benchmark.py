@@ -2,7 +2,7 @@
 
 import argparse
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -86,7 +86,7 @@ def _names(text: str) -> list[str]:
 
 
 def _agent_file(text: str) -> tuple[str, Path]:
-    """The name of an agent, "" for its algorithm's, and its file."""
+    """Return the name of an agent, "" for its algorithm's, and its file."""
     name, equals, file = text.partition("=")
     return (name, Path(file)) if equals and name and "/" not in name else ("", Path(text))
 
@@ -104,7 +104,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def folder_of(arguments: argparse.Namespace) -> Path:
-    """Folder of the committed results of an environment."""
+    """Return the folder of the committed results of an environment."""
     return RESULTS / TASKS[arguments.env].name
 
 
@@ -124,16 +124,21 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     if not arguments.quiet:
         print(terminal(found))
         slow = {each.name for each in task.controllers() if each.slow} - {each.name for each in contenders}
-        if arguments.controllers == ["all"] and slow:
-            names = ", ".join(sorted(slow))
-            print(f"left out of all: {names}, which are slow and not cached for every episode; add --slow to run them")
-        wrote = ", ".join(relative_path(path) for path in (arguments.out, arguments.json) if path)
-        print(f"wrote {wrote}" + (f"; open {relative_path(arguments.out / 'report.html')}" if arguments.out else ""))
+        print_ending(arguments, slow)
     return 0
 
 
+def print_ending(arguments: argparse.Namespace, left_out: set[str]) -> None:
+    """Print the slow controllers that ``all`` left out, and where the results are."""
+    if arguments.controllers == ["all"] and left_out:
+        names = ", ".join(sorted(left_out))
+        print(f"left out of all: {names}, which are slow and not cached for every episode; add --slow to run them")
+    wrote = ", ".join(relative_path(path) for path in (arguments.out, arguments.json) if path)
+    print(f"wrote {wrote}" + (f"; open {relative_path(arguments.out / 'report.html')}" if arguments.out else ""))
+
+
 def cases_of(arguments: argparse.Namespace) -> list[Case]:
-    """Scenarios that the command line asks for, as cases of the protocol."""
+    """Return the scenarios that the command line asks for, as cases of the protocol."""
     task = TASKS[arguments.env]
     graded = arguments.puller and task.graded
     if arguments.tolerance is not None and not (graded and 0.0 < arguments.tolerance <= 50.0):
@@ -147,7 +152,7 @@ def cases_of(arguments: argparse.Namespace) -> list[Case]:
 
 
 def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[Contender]:
-    """Controllers and agents that the command line asks for, classical controllers first; CzError for unknown ones.
+    """Return the controllers and agents asked for, classical controllers first; CzError for unknown ones.
 
     Those of the user's files always take part, shipped agents by default if no agent is given, slow controllers if
     ``--slow`` asks for them, or if they are named and all their episodes cached.
@@ -157,32 +162,39 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
     names = [each.name for each in controllers]
     new = [name for name in given if name not in shipped]
     user_code.check_apart([*names, *shipped, *new, *(each.name for each in own)], "controller")
-
-    def may_run(each: Contender) -> bool:
-        return not each.slow or arguments.slow or is_cached(each, cases, arguments.episodes, CACHE)
-
-    agents = list(given) or ([] if arguments.puller else shipped)
-    if arguments.controllers == ["all"]:
-        wanted = [each.name for each in controllers if may_run(each)] + agents
-    else:
-        wanted = arguments.controllers or default_names(arguments, controllers, agents)
+    wanted = wanted_names(arguments, cases, list(given) or ([] if arguments.puller else shipped))
     for name in wanted:
         if name not in (known := [*names, *new, *shipped]):
             raise CzError(unknown_name_message("controller", name, known, ", or all"))
     chosen = [each for each in controllers if each.name in wanted]
     for each in chosen:
-        if not may_run(each):
+        if not may_run(each, arguments, cases):
             raise CzError(f"{each.name!r} is slow: add --slow to run it on the first {SLOW_EPISODES} episodes")
-    files = {name: shipped_seeds(name) for name in shipped if name in wanted and name not in given}
-    chosen += [*given.values(), *(agent(name, [*map(OnnxPolicy.load, some)]) for name, some in files.items())]
+    chosen += agents_of(given, [name for name in shipped if name in wanted])
     check_agents(chosen, cases)
     if not (chosen or own):
         raise CzError("no controller takes part: name some with --controllers")
     return [*chosen, *own]
 
 
-def default_names(arguments: argparse.Namespace, controllers: Sequence[Contender], agents: Sequence[str]) -> list[str]:
-    """Names of the controllers and agents of a run that names none: fewer on a puller, or beside the user's own."""
+def agents_of(given: Mapping[str, Contender], shipped: Sequence[str]) -> list[Contender]:
+    """Return the agents of the user's files, then the shipped ones of these names that no file replaces."""
+    files = {name: shipped_seeds(name) for name in shipped if name not in given}
+    return [*given.values(), *(agent(name, [*map(OnnxPolicy.load, some)]) for name, some in files.items())]
+
+
+def may_run(contender: Contender, arguments: argparse.Namespace, cases: Sequence[Case]) -> bool:
+    """Return whether a controller is quick, asked for with ``--slow``, or cached."""
+    return not contender.slow or arguments.slow or is_cached(contender, cases, arguments.episodes, CACHE)
+
+
+def wanted_names(arguments: argparse.Namespace, cases: Sequence[Case], agents: Sequence[str]) -> list[str]:
+    """Return the names that ``--controllers`` has or means; without it fewer on a puller, or beside the user's own."""
+    controllers = TASKS[arguments.env].controllers()
+    if arguments.controllers == ["all"]:
+        return [*(each.name for each in controllers if may_run(each, arguments, cases)), *agents]
+    if arguments.controllers:
+        return [*arguments.controllers]
     if arguments.puller:
         return [*(each.name for each in controllers if each.on_puller), *agents]
     if arguments.controller and not arguments.slow:
@@ -192,7 +204,7 @@ def default_names(arguments: argparse.Namespace, controllers: Sequence[Contender
 
 
 def given_agents(arguments: argparse.Namespace) -> dict[str, Contender]:
-    """Agents of files by name: the files of one name are its training seeds."""
+    """Return the agents of files by name: the files of one name are its training seeds."""
     policies: dict[str, list[OnnxPolicy]] = {}
     for name, file in arguments.agent:
         if str(file) in shipped_names(arguments.env) and not file.exists():
@@ -203,7 +215,7 @@ def given_agents(arguments: argparse.Namespace) -> dict[str, Contender]:
 
 
 def is_partial(arguments: argparse.Namespace, contenders: Sequence[Contender], cases: Sequence[Case]) -> bool:
-    """Whether the run holds less than the default one, or something of the user's own."""
+    """Return whether the run holds less than the default one, or something of the user's own."""
     usual = {each.name for each in TASKS[arguments.env].controllers() if each.default and not each.slow}
     usual |= set(shipped_names(arguments.env))
     usual_cases = {case for case in TASKS[arguments.env].cases if case.default}

@@ -38,9 +38,8 @@ def check_targets(folder: Path | None, lone: Path | None, partial: bool, overwri
         raise CzError(f"--json {lone} is a folder")
     if present and not overwrite:
         raise CzError(f"{present[0]} exists: add --overwrite, or name another --out or --json")
-    for place in (folder, lone and lone.parent):
-        if place:
-            check_writable(place)
+    for place in filter(None, (folder, lone and lone.parent)):
+        check_writable(place)
 
 
 def write(

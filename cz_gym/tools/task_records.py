@@ -179,21 +179,30 @@ def body_verdict(benchmark: Benchmark, column: Column = RMSE) -> Verdict:
     where: dict[str, list[str]] = {"a classical controller": [], "a learned agent": [], "": []}
     rows = []
     for case in cases:
-        rival, differences = str(benchmark.rival(case)), benchmark.verdicts(case)
-
-        def error(name: str, case: Case = case) -> float:
-            return benchmark.mean(case, name, RMSE.metric)
-
-        won = [name for name, each in differences.items() if each.ends[1] < 0.0]
-        best = min(won, key=error) if won else rival
-        row = [f"{rival} {column.of(benchmark, case, rival)}"]
-        for names in groups.values():
-            name = min(names, key=error)
-            row += [f"{name} {column.of(benchmark, case, name)}", RMSE.text(differences[name])]
-        clear = won or all(each.ends[0] > 0.0 for each in differences.values())
-        where["a learned agent" if won else "a classical controller" if clear else ""].append(case.name)
-        rows.append((case.name, *row, best if clear else "no difference shown"))
+        winner, row = _compare_kinds(benchmark, case, groups, column)
+        where[winner].append(case.name)
+        rows.append(row)
     return Verdict(_sentence(where), (*heads, "lowest error"), tuple(rows))
+
+
+def _compare_kinds(
+    benchmark: Benchmark, case: Case, groups: Mapping[str, Sequence[str]], column: Column
+) -> tuple[str, tuple[str, ...]]:
+    """Return the kind with the lowest error on a scenario, "" for neither, and the scenario's row."""
+    rival, differences = str(benchmark.rival(case)), benchmark.verdicts(case)
+
+    def error(name: str) -> float:
+        return benchmark.mean(case, name, RMSE.metric)
+
+    won = [name for name, each in differences.items() if each.ends[1] < 0.0]
+    best = min(won, key=error) if won else rival
+    row = [f"{rival} {column.of(benchmark, case, rival)}"]
+    for names in groups.values():
+        name = min(names, key=error)
+        row += [f"{name} {column.of(benchmark, case, name)}", RMSE.text(differences[name])]
+    clear = won or all(each.ends[0] > 0.0 for each in differences.values())
+    winner = "a learned agent" if won else "a classical controller" if clear else ""
+    return winner, (case.name, *row, best if clear else "no difference shown")
 
 
 def _sentence(where: Mapping[str, Sequence[str]]) -> str:

@@ -1,6 +1,6 @@
 """The figures of ``report.md`` as PNG: the first crystal under some controllers, and error against pull activity."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from textwrap import fill
 from typing import Any, NamedTuple
 
@@ -43,7 +43,7 @@ def floor_of(benchmark: Benchmark) -> float:
 
 def pareto(benchmark: Benchmark) -> bytes:
     """Draw mean RMSE, up to :data:`FAR` times the least, against pull step RMS; the :func:`.chosen` have colours."""
-    cases, known = benchmark.cases, [each.name for each in benchmark.contenders]
+    cases = benchmark.cases
     names = [each.name for each in chosen(benchmark, cases[0], NAMED)]
     floor, style = floor_of(benchmark), styles_of(benchmark.contenders)
     columns = min(len(cases), 2)
@@ -51,23 +51,7 @@ def pareto(benchmark: Benchmark) -> bytes:
     figure = canvas(4.5 * columns, 2.9 * rows + 1.2)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
     for axis, case in zip(axes, cases, strict=False):
-        axis.set(xscale="log", yscale="log", xlabel=PULL_STEP.heading, ylabel=RMSE.heading)
-        axis.tick_params(labelbottom=True, labelleft=True)
-        axis.set_title(case.name, fontsize=9.5)
-        points = {name: [benchmark.get(case, name, each.metric) for each in (RMSE, PULL_STEP)] for name in known}
-        pairs: Any = points.items()
-        most = FAR * min((error.mean for _, (error, activity) in pairs if activity.mean > 0.0), default=np.inf)
-        for name, (error, activity) in pairs:
-            x = max(activity.mean, floor)
-            if error.mean <= most and name not in names:
-                axis.plot(x, error.mean, "o", ms=3, color=GREY, zorder=1)
-            elif error.mean <= most:
-                look = {"fmt": style[name].marker, "color": style[name].colour, "ms": 7, "mfc": "none", "mew": 1.6}
-                spans = {"yerr": _arms(error), "xerr": None if activity.mean < floor else _arms(activity)}
-                axis.errorbar(x, error.mean, **spans, **look, elinewidth=1.2)
-                if activity.mean < floor:
-                    below = {"xytext": (0, -14), "textcoords": "offset points", "ha": "center", "fontsize": 8}
-                    axis.annotate("← 0", (x, error.mean), color=INK, **below)
+        _points(axis, benchmark, case, names, floor)
         for numbers in (axis.xaxis, axis.yaxis):
             numbers.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             numbers.set_major_formatter("{x:g}")
@@ -79,6 +63,28 @@ def pareto(benchmark: Benchmark) -> bytes:
     figure.legend(loc="outside lower center", ncols=2 * columns, frameon=False, fontsize=9)
     figure.suptitle("Error against pull activity: lower left is better, bars are 95 % intervals", fontsize=11)
     return png(figure)
+
+
+def _points(axis: Any, benchmark: Benchmark, case: Case, names: Sequence[str], floor: float) -> None:
+    """Draw a point a controller of a scenario, those of ``names`` with a marker and error bars."""
+    style, known = styles_of(benchmark.contenders), [each.name for each in benchmark.contenders]
+    axis.set(xscale="log", yscale="log", xlabel=PULL_STEP.heading, ylabel=RMSE.heading)
+    axis.tick_params(labelbottom=True, labelleft=True)
+    axis.set_title(case.name, fontsize=9.5)
+    points = {name: [benchmark.get(case, name, each.metric) for each in (RMSE, PULL_STEP)] for name in known}
+    pairs: Any = points.items()
+    most = FAR * min((error.mean for _, (error, activity) in pairs if activity.mean > 0.0), default=np.inf)
+    for name, (error, activity) in pairs:
+        x = max(activity.mean, floor)
+        if error.mean <= most and name not in names:
+            axis.plot(x, error.mean, "o", ms=3, color=GREY, zorder=1)
+        elif error.mean <= most:
+            look = {"fmt": style[name].marker, "color": style[name].colour, "ms": 7, "mfc": "none", "mew": 1.6}
+            spans = {"yerr": _arms(error), "xerr": None if activity.mean < floor else _arms(activity)}
+            axis.errorbar(x, error.mean, **spans, **look, elinewidth=1.2)
+            if activity.mean < floor:
+                below = {"xytext": (0, -14), "textcoords": "offset points", "ha": "center", "fontsize": 8}
+                axis.annotate("← 0", (x, error.mean), color=INK, **below)
 
 
 def _arms(estimate: Estimate) -> list[list[float]]:

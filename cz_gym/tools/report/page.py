@@ -123,6 +123,7 @@ def _draw(figure: go.Figure, scenario: int, benchmark: Benchmark, case: Case) ->
     task, styles = task_of(case), styles_of(benchmark.contenders)
     names = [each.name for each in chosen(benchmark, case, COLUMNS)]
     fates = {name: lost(benchmark, case, name) for name in names}
+    whole = [name for name in names if not fates[name]] or names
     signals = {name: benchmark.signals[case.name, name] for name in names}
     longest = max(signals.values(), key=lambda each: len(each.r_c))
     bias = 0.0 if task.by_length else ring_bias(case, benchmark.seeds(case)[0])
@@ -134,23 +135,30 @@ def _draw(figure: go.Figure, scenario: int, benchmark: Benchmark, case: Case) ->
         for line, name, own in _lines(panel, names):
             logged = signals[name] if own else longest
             values = _points(panel.lines[line](logged, bias) / panel.scale, step)
-            places = {"x0": 0.5 * minutes, "dx": minutes}
-            look = {"name": plain(name) if own else line, "showlegend": False}
-            if own and not number and line == "true":
-                rmse = f"{benchmark.values(case, name, RMSE.metric)[0, 0]:.3f} mm{', lost' * fates[name]}"
-                look = {"name": f"{look['name']}: {rmse}", "showlegend": True}
-            colour, camera = styles[name].colour if own else INK, line == "camera"
-            figure.add_scatter(
-                row=number + 1, col=1, y=values, mode="lines", **look,
-                **({"x": _points(logged.L / MM, step)[: len(values)]} if task.by_length else places),
-                line={"color": colour, "width": 0.8 if camera else 1.5, "dash": "solid" if own else "dash"},
-                opacity=0.35 if camera else 1.0, legendgroup=name if own else line, meta=scenario,
-            )  # fmt: skip
-            if len(values) and not (own and fates[name] and not all(fates.values())):
+            look = {"name": line, "legendgroup": line, **_DRAWN["shared"]}
+            if own:
+                rmse = f": {benchmark.values(case, name, RMSE.metric)[0, 0]:.3f} mm{', lost' * fates[name]}"
+                title = plain(name) + rmse * (titled := not number and line == "true")
+                look = {"name": title, "showlegend": titled, "legendgroup": name, **_DRAWN[line]}
+                look["line"] = {**look["line"], "color": styles[name].colour}
+            if task.by_length:
+                look["x"] = _points(logged.L / MM, step)[: len(values)]
+            else:
+                look |= {"x0": 0.5 * minutes, "dx": minutes}
+            figure.add_scatter(row=number + 1, col=1, y=values, mode="lines", meta=scenario, **look)
+            if len(values) and (not own or name in whole):
                 ends += np.quantile(values, [OUTLIERS, 1.0 - OUTLIERS]).tolist()
         margin = max(0.08 * (max(ends) - min(ends)), 1e-3)
         layout[f"yaxis{number + 1 if number else ''}.range"] = [min(ends) - margin, max(ends) + margin]
     return layout
+
+
+_DRAWN: dict[str, dict[str, Any]] = {
+    "true": {"line": {"width": 1.5, "dash": "solid"}, "opacity": 1.0},
+    "camera": {"line": {"width": 0.8, "dash": "solid"}, "opacity": 0.35},
+    "shared": {"line": {"width": 1.5, "dash": "dash", "color": INK}, "opacity": 1.0, "showlegend": False},
+}
+"""Style of a line; those that are drawn for each controller have its colour."""
 
 
 def _lines(panel: Panel, names: Sequence[str]) -> list[tuple[str, str, bool]]:
