@@ -33,8 +33,8 @@ from cz_gym.tools.registry import CONTROLLERS
 from cz_gym.tools.report.markdown import summary
 from cz_gym.tools.report.tables import RMSE
 from cz_gym.tools.report.tables import markdown as table
+from cz_gym.tools.report.task_records import contract_hash
 from cz_gym.tools.run import check_agents, run
-from cz_gym.tools.task_records import contract_hash
 
 FRESH = range(3_000_000, 2**31)
 """Seeds that no training, validation or test uses."""

@@ -14,7 +14,7 @@ from cz_gym.evaluation.protocol import Case, Contender, find_case
 from cz_gym.evaluation.rollout import Rollout, rollout
 from cz_gym.tools.episodes import KEYS, Benchmark
 from cz_gym.tools.registry import find_controller
-from cz_gym.tools.task_records import task_of
+from cz_gym.tools.report.task_records import task_of
 
 NOMINAL_LQG = LQG(
     design=with_values(

@@ -17,8 +17,8 @@ from cz_gym.support.units import MM
 from cz_gym.tools.report.markdown import terminal
 
 from .files import check_targets, write
+from .report.task_records import TASKS
 from .run import check_agents, is_cached, run
-from .task_records import TASKS
 
 CLONE = Path(__file__).resolve().parents[2]
 RESULTS = CLONE / "results" if (CLONE / "results" / "benchmark").is_dir() else Path("runs")

@@ -15,7 +15,7 @@ from cz_gym.support.files import check_writable, name_file_in_errors, write_file
 from cz_gym.support.names import software
 
 from .episodes import Benchmark, to_csv
-from .task_records import contract_hash
+from .report.task_records import contract_hash
 
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime")
 """Packages whose versions are recorded."""

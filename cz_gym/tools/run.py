@@ -26,7 +26,7 @@ from cz_gym.support.files import write_files
 from cz_gym.support.names import software
 
 from .episodes import CODE, CONTRACT, GAPS, KEYS, Benchmark, read_episodes, to_csv, values_of
-from .task_records import contract_hash, task_of
+from .report.task_records import contract_hash, task_of
 
 PRINTED = 1e-4
 """Relative precision of the figures in the bounds' table, five digits [-]."""

@@ -27,8 +27,8 @@ from cz_gym.jit import force_inlined, jittable
 from cz_gym.physics.schedule import bias_offset, recipe, reference
 from cz_gym.process import DONE, GROWS, LOST, PULL_SCALE, Channel, Inputs, Past, PerfectReadings, Process, Relative
 from cz_gym.tools.report.tables import rows
+from cz_gym.tools.report.task_records import BODY_DRIVES, BODY_ERROR
 from cz_gym.tools.run import run as benchmark
-from cz_gym.tools.task_records import BODY_DRIVES, BODY_ERROR
 from tests.vector_checker import check_vector_env
 
 # The process: at most 80 lines to the mark below.

@@ -9,7 +9,7 @@ import pytest
 
 from cz_gym import agents
 from cz_gym.evaluation.protocol import CASES, TRAINING_SEEDS
-from cz_gym.tools.task_records import contract_hash
+from cz_gym.tools.report.task_records import contract_hash
 from studies import leaderboard
 
 MEAN = {"mean": 0.0125, "ci95": None}

@@ -14,7 +14,7 @@ from cz_gym.evaluation.rollout import Floats
 from cz_gym.evaluation.statistics import Estimate
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
 from cz_gym.tools.episodes import Benchmark
-from cz_gym.tools.task_records import task_of
+from cz_gym.tools.report.task_records import task_of
 
 from .tables import PULL_STEP, RMSE, chosen
 

@@ -14,7 +14,7 @@ from cz_gym.puller.file import DEFAULT
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import MM, PERCENT
 from cz_gym.tools.episodes import Benchmark
-from cz_gym.tools.task_records import BODY_DRIVES, contract_hash, task_of
+from cz_gym.tools.report.task_records import BODY_DRIVES, contract_hash, task_of
 
 from .tables import (
     FAILURES,

@@ -20,7 +20,7 @@ from cz_gym.evaluation.rollout import Floats
 from cz_gym.evaluation.statistics import Estimate
 from cz_gym.support.units import HOUR, MINUTE, MM
 from cz_gym.tools.episodes import Benchmark
-from cz_gym.tools.task_records import Panel, task_of
+from cz_gym.tools.report.task_records import Panel, task_of
 
 from . import markdown, tables
 from .figures import floor_of, lost

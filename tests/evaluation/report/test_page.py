@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from cz_gym.tools import benchmark
 from cz_gym.tools.report.page import crystal, page, pareto, plain
 from cz_gym.tools.report.tables import comparison
-from cz_gym.tools.task_records import BODY_DRIVES, BODY_ERROR, PANELS, body_overview
+from cz_gym.tools.report.task_records import BODY_DRIVES, BODY_ERROR, PANELS, body_overview
 from tests.samples import joined, result_of
 
 EVIL = "</script><img src=x onerror=alert(1)>\"'&amp;<b>\u2028%{x}|"

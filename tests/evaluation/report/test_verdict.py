@@ -8,12 +8,11 @@ import pandas as pd
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.evaluation.protocol import Case
 from cz_gym.evaluation.statistics import Estimate
-from cz_gym.tools import task_records
 from cz_gym.tools.episodes import ESTIMATES
-from cz_gym.tools.report import tables
+from cz_gym.tools.report import tables, task_records
 from cz_gym.tools.report.tables import FEWEST, best_of_each_kind
-from cz_gym.tools.task_records import body_verdict as verdict
-from cz_gym.tools.task_records import crystal_verdict
+from cz_gym.tools.report.task_records import body_verdict as verdict
+from cz_gym.tools.report.task_records import crystal_verdict
 from tests import samples
 from tests.samples import contender, joined
 

@@ -27,10 +27,10 @@ from cz_gym.evaluation.metrics import (
 from cz_gym.evaluation.protocol import CASES, CRYSTAL_CASES, REFERENCE, Case, Contender
 from cz_gym.evaluation.rollout import Floats, Rollout
 from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN, PERCENT
+from cz_gym.tools import registry
+from cz_gym.tools.episodes import Benchmark
 
-from . import registry
-from .episodes import Benchmark
-from .report.tables import (
+from .tables import (
     FAILURES,
     HEATER_STEP,
     MEAN_PULL,
