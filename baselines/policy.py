@@ -1,5 +1,6 @@
 """The interface that controllers and agents share: stable-baselines3's ``predict``, for a batch of crystals at once."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -12,8 +13,10 @@ import numpy.typing as npt
 from cz_gym.body.process import BODY
 from cz_gym.body.signals import Measured
 from cz_gym.config import Config, positive
+from cz_gym.jit import labelled
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
+from cz_gym.physics.plant import make_puller
 from cz_gym.process import Process
 from cz_gym.puller.file import DEFAULT, PullerFile
 from cz_gym.spaces import TargetEnv, decode, readable, tag
@@ -39,11 +42,46 @@ class Policy(Protocol):
         ...
 
 
+READING_SCALE, READING_OFFSET = 0.03, 0.02
+"""Errors that the reading of an applied drive may have: share of the reading, share of the drive's full range [-]."""
+DIFFERENCE_TIME = 60.0
+"""Time constant of the average of reading minus setpoint [s]."""
+
+
+class DriveLimits(NamedTuple):
+    """Limits of the drives of a puller, beyond the ranges of the actions."""
+
+    pull_window: float = math.inf
+    """Largest |v_p - v_0| [m/s]."""
+    pull_slew: float = math.inf
+    """[m/s2]."""
+    heater_slew: float = math.inf
+    """[W/s]."""
+    heater_step: float = 0.0
+    """Whole steps in which the heater moves [W]; 0: none."""
+
+    def moved(self, applied: Floats, wanted: Floats, dt: float) -> Floats:
+        """Setpoints within the limits dt [s] after they were ``applied``, deviations [m/s, W], shape (n, 2)."""
+        wanted = np.stack([np.clip(wanted[:, 0], -self.pull_window, self.pull_window), wanted[:, 1]], axis=-1)
+        most = dt * np.array([self.pull_slew, self.heater_slew])
+        return applied + np.clip(wanted - applied, -most, most)
+
+    def whole(self, setpoints: Floats) -> Floats:
+        """Setpoints with the power in whole steps, shape (n, 2)."""
+        if not self.heater_step:
+            return setpoints
+        return np.stack([setpoints[:, 0], self.heater_step * np.rint(setpoints[:, 1] / self.heater_step)], axis=-1)
+
+
 class ControllerState(NamedTuple):
     """The memory of a :class:`MeasuredController`."""
 
     readings: Measured
     """Last number that was read from each channel, SI units, each of shape (n,)."""
+    asked: Floats
+    """Last setpoints within the drives' limits, deviations from nominal [m/s, W], shape (n, 2)."""
+    difference: Floats
+    """Readings of the drives minus these, averaged over :data:`DIFFERENCE_TIME`, shape (n, 2)."""
     memory: Any
     """The controller's own memory."""
 
@@ -75,6 +113,8 @@ class MeasuredController(ABC):
     """Meniscus of the nominal puller."""
     puller: PullerFile = field(default=DEFAULT, kw_only=True)
     """The machine that it is for."""
+    limits: DriveLimits = field(default=DriveLimits(), kw_only=True)
+    """Limits of its drives."""
     any_environment: bool = field(default=False, kw_only=True)
     """Lets every environment take the actions (``made_for`` is None)."""
 
@@ -118,7 +158,29 @@ class MeasuredController(ABC):
     def for_config(self, config: Config) -> Self:
         """Return the controller for the control interval and the puller of an environment."""
         names = "control_interval", "parameters", "meniscus", "puller"
-        return replace(self, **{name: getattr(config, name) for name in names})
+        drives = [each.actuators for each in config.scenario.scenarios]
+        limits = DriveLimits._make(max(getattr(each, name) for each in drives) for name in DriveLimits._fields)
+        return replace(self, limits=limits, **{name: getattr(config, name) for name in names})
+
+    @cached_property
+    def tolerance(self) -> Floats:
+        """Largest lasting errors of the drives' readings that are expected [m/s, W], shape (2,)."""
+        puller = make_puller(labelled(Parameters, self.parameters), meniscus=self.meniscus)
+        ranges = np.array([self.v_0, self.heater_range])
+        largest = np.array([puller.v_0, puller.Q_H_0]) + ranges
+        tolerance: Floats = READING_SCALE * largest + 2.0 * READING_OFFSET * ranges
+        return tolerance
+
+    def applied(self, seen: Measured, asked: Floats, difference: Floats) -> tuple[Floats, Floats]:
+        """The applied drives, deviations [m/s, W], and the averaged difference of their readings, each of shape (n, 2).
+
+        Drives are taken to follow their setpoints. A move that began at an erring reading would add its error at every
+        sample. Only a difference that lasts and is larger than readings err (:attr:`tolerance`) counts as a drive that
+        does not follow.
+        """
+        share = -math.expm1(-self.control_interval / DIFFERENCE_TIME)
+        difference = difference + share * (drives_of(seen) - asked - difference)
+        return asked + difference - np.clip(difference, -self.tolerance, self.tolerance), difference
 
     @abstractmethod
     def at_rest(self, seen: Measured) -> Any:
@@ -141,13 +203,20 @@ class MeasuredController(ABC):
         seen = self.read(array)
         if state is None or (episode_start is not None and np.any(episode_start)):
             first = type(seen)(*(np.where(np.isfinite(channel), channel, 0.0) for channel in seen))
-            state = reset_rows(state, ControllerState(first, self.at_rest(first)), episode_start)
+            asked, difference = self.applied(first, np.zeros((len(array), 2)), drives_of(first))
+            first = first._replace(v_p=asked[:, 0], Q_H=asked[:, 1])
+            state = reset_rows(state, ControllerState(first, asked, difference, self.at_rest(first)), episode_start)
         good = np.isfinite(array).all() and (seen.valid > 0.5).all()
         read = seen if good else readable(seen, state.readings)
-        given = read._replace(T_1=seen.T_1) if self.accepts_missing_temperature else read
+        applied, difference = self.applied(read, state.asked, state.difference)
+        pull, power = self.limits.whole(applied).T
+        given = read._replace(v_p=pull, Q_H=power)
+        given = given._replace(T_1=seen.T_1) if self.accepts_missing_temperature else given
         pull, power, memory = self.step(given, state.memory)
         action = to_action(pull / self.v_0, power / self.heater_range, single)
-        return tag(action, self.made_for), ControllerState(read, memory)
+        wanted = np.atleast_2d(action) * np.array([self.v_0, self.heater_range])
+        asked = self.limits.moved(applied, wanted, self.control_interval)
+        return tag(action, self.made_for), ControllerState(read, asked, difference, memory)
 
 
 @dataclass(frozen=True)
@@ -163,6 +232,11 @@ class OpenLoop:
         array, single = batched(observation)
         zero = np.zeros(len(array))
         return to_action(zero, zero, single), state
+
+
+def drives_of(seen: Measured) -> Floats:
+    """Readings of pull speed and power, deviations [m/s, W], shape (n, 2)."""
+    return np.stack([seen.v_p, seen.Q_H], axis=-1)
 
 
 def batched(observation: Any) -> tuple[Floats, bool]:
