@@ -25,13 +25,13 @@ from cz_gym.physics.numerics import Floats, StateSpace
 from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.process import HEATER_SCALE, PULL_SCALE, scales
-from cz_gym.spaces import HEATER_RANGE, MEASURED
+from cz_gym.spaces import DRIVE_CHANNELS, HEATER_RANGE, MEASURED
 from cz_gym.support.errors import CzError
 from cz_gym.support.names import leaves, map_arrays
 
 from .lqg import LQG
 from .pid import Compensator, FilteredPID, SeriesPID
-from .policy import ControllerState, OpenLoop
+from .policy import ControllerState, DriveLimits, MeasuredController, OpenLoop
 
 _SMALL = 1e-6
 """Observed amplitude below every limit, gate and dead zone [-]; float32 actions keep their relative precision."""
@@ -84,21 +84,25 @@ def linear_controller(
     """The controller in discrete time: inputs the channels of Measured, outputs v_p - v_0 [m/s] and Q_H - Q_H0 [W].
 
     ``ranges`` [m/s, W] is what an action of 1 moves the drives by. ``rest`` is its memory at rest, by default that
-    after one sample of zeros. ``free`` names the parts of it that move ("memory.filter.mean"), by default all but the
-    last readings; the others, such as a covariance, keep their value.
+    after one sample of zeros. ``free`` names the parts of it that move ("memory.filter.mean"), by default all of the
+    controller's own; the others, such as a covariance, keep their value. The inputs v_p and Q_H are the applied drives,
+    which a :class:`~.policy.MeasuredController` takes from its last setpoints; limits of drives are left out.
     Raises NotLinearError if the controller does not rest there, or if twice the input does not double the answer.
     """
     channels, name = len(MEASURED), type(policy).__name__
+    policy = replace(policy, limits=DriveLimits()) if isinstance(policy, MeasuredController) else policy
     rest = policy.predict(_AT_REST[None])[1] if rest is None else rest
     rest = () if rest is None else rest
     if not isinstance(rest, tuple):
         raise NotLinearError(f"{name} has a memory that is no named tuple of arrays, so it has no state space here")
     parts = _parts(rest)
     if free is None:
-        free = [part for part in parts if not (isinstance(rest, ControllerState) and part.startswith("readings."))]
+        shell = ("readings.", "asked", "difference") if isinstance(rest, ControllerState) else ()
+        free = [part for part in parts if not part.startswith(shell)] if shell else [*parts]
     memory = sum(parts[part].size for part in free)
     probes = np.eye(memory + channels) * _SMALL
-    still, once, twice = (_answer(policy, factor * probes, rest, free) for factor in (0.0, 1.0, 2.0))
+    sizes = scales(MEASURED, *ranges)
+    still, once, twice = (_answer(policy, factor * probes, rest, free, sizes) for factor in (0.0, 1.0, 2.0))
     once, twice = once - still, twice - still
     largest = np.abs(once).max(axis=0)
     if np.any(np.abs(still) > 1e-3 * _SMALL):
@@ -106,7 +110,7 @@ def linear_controller(
     if np.any(np.abs(twice - 2.0 * once) > 1e-4 * largest):
         raise NotLinearError(f"{name} is not linear near rest")
     gains = once.T / _SMALL
-    gains[:, memory:] /= scales(MEASURED, *ranges)
+    gains[:, memory:] /= sizes
     gains[memory:] *= np.array(ranges)[:, None]
     (A, B), (C, D) = (np.split(rows, [memory], axis=1) for rows in np.split(gains, [memory]))
     return StateSpace(A, B, C, D)
@@ -117,7 +121,7 @@ def _parts(memory: Any) -> dict[str, Floats]:
     return {name: np.asarray(part, np.float64)[:1] for name, part in leaves(memory, ".").items()}
 
 
-def _answer(policy: Any, probes: Floats, rest: Any, free: Sequence[str]) -> Floats:
+def _answer(policy: Any, probes: Floats, rest: Any, free: Sequence[str], sizes: Floats) -> Floats:
     """The next free memory and the action for rows of (free memory, observation), both relative to rest."""
     n, start, parts = len(probes), 0, {}
     for name, value in _parts(rest).items():
@@ -125,6 +129,8 @@ def _answer(policy: Any, probes: Floats, rest: Any, free: Sequence[str]) -> Floa
         if name in free:
             parts[name] += probes[:, start : start + value.size].reshape(n, *value.shape[1:])
             start += value.size
+    if isinstance(rest, ControllerState):
+        parts["asked"] += (probes[:, start:] * sizes)[:, DRIVE_CHANNELS]
     values = iter(parts.values())
     action, after = policy.predict(_AT_REST + probes[:, start:], state=map_arrays(lambda _: next(values), rest))
     moved = map_arrays(lambda new, old: np.reshape(new - old[:1], (1, n, -1)), rest if after is None else after, rest)
@@ -380,10 +386,10 @@ def _lqg(policy: LQG, sensor: Sensor) -> LinearForm:
             observation[Measured._fields.index(name)] = sd / scale[name] * random.standard_normal()
         _, state = linear.predict(observation, state)
     assert state is not None
-    readings = map_arrays(np.zeros_like, state.readings)
+    rest = map_arrays(np.zeros_like, state._replace(memory=()))
     memory, moving = state.memory, ("memory.filter.mean", "memory.command")
     settled = memory.filter._replace(mean=0.0 * memory.filter.mean)
     still = memory._replace(filter=settled, plan=0.0 * memory.plan, command=0.0 * memory.command)
-    rest = state._replace(readings=readings, memory=still)
+    rest = rest._replace(memory=still)
     controller = linear_controller(linear, (policy.v_0, policy.heater_range), rest, moving)
     return LinearForm(controller, controller, policy.control_interval)

@@ -174,9 +174,9 @@ class MeasuredController(ABC):
     def applied(self, seen: Measured, asked: Floats, difference: Floats) -> tuple[Floats, Floats]:
         """The applied drives, deviations [m/s, W], and the averaged difference of their readings, each of shape (n, 2).
 
-        Drives are taken to follow their setpoints. A move that began at an erring reading would add its error at every
-        sample. Only a difference that lasts and is larger than readings err (:attr:`tolerance`) counts as a drive that
-        does not follow.
+        Drives are taken to follow their setpoints; the first one is what is read. A move that began at an erring
+        reading would add its error at every sample. Only a difference that lasts and is larger than readings err
+        (:attr:`tolerance`) counts as a drive that does not follow.
         """
         share = -math.expm1(-self.control_interval / DIFFERENCE_TIME)
         difference = difference + share * (drives_of(seen) - asked - difference)
@@ -203,8 +203,7 @@ class MeasuredController(ABC):
         seen = self.read(array)
         if state is None or (episode_start is not None and np.any(episode_start)):
             first = type(seen)(*(np.where(np.isfinite(channel), channel, 0.0) for channel in seen))
-            asked, difference = self.applied(first, np.zeros((len(array), 2)), drives_of(first))
-            first = first._replace(v_p=asked[:, 0], Q_H=asked[:, 1])
+            asked, difference = drives_of(first), np.zeros((len(array), 2))
             state = reset_rows(state, ControllerState(first, asked, difference, self.at_rest(first)), episode_start)
         good = np.isfinite(array).all() and (seen.valid > 0.5).all()
         read = seen if good else readable(seen, state.readings)

@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 from cz_gym import make_puller
 from cz_gym.baselines.analysis import linear_form, loop_margins
 from cz_gym.baselines.pid import CompensatedPID, Compensator, FilteredPID, SeriesPID, TemperatureLoop
+from cz_gym.baselines.policy import DriveLimits
 from cz_gym.baselines.tuned import TUNED
 from cz_gym.baselines.tuned_controllers import PIDS, below_half_the_zero
 from cz_gym.body.process import radius_model
@@ -63,10 +64,12 @@ def test_switching_on_moves_nothing(applied):
     np.testing.assert_allclose(memory.memory.start, 0.3 * MM * math.exp(-5.0 / 200.0))
 
 
-def test_integrator_waits_where_the_drive_is_stuck():
+def test_integrator_waits_where_the_drive_is_at_its_limit():
     """Back-calculation settles where T_i gains per sample what T_track takes: excess = K_p e T_track / T_i."""
     pid = SeriesPID(K_p=0.01, T_i=1000.0, T_d=0.0)
-    policy = FilteredPID(pid=pid, compensator=None, T_f=0.0, T_track=50.0)
+    policy = FilteredPID(
+        pid=pid, compensator=None, T_f=0.0, T_track=50.0, limits=DriveLimits(pull_window=0.3 * MM_PER_MIN)
+    )
     stuck = measured(ring_error=0.2 * MM, v_p=0.3 * MM_PER_MIN)
     state = None
     for _ in range(400):
@@ -155,7 +158,8 @@ def test_compensator_is_the_papers_driven_by_the_applied_pull(dt, rng):
     state, y = None, []
     controller = CompensatedPID(dt)
     for seen in [0.0, *applied]:
-        _, state = controller.predict(measured(v_p=seen), state)
+        asked = None if state is None else state._replace(asked=np.array([[seen, 0.0]]))
+        _, state = controller.predict(measured(v_p=seen), asked)
         y.append(state.memory.compensator[0] @ [0.0, -0.22517])
     np.testing.assert_allclose(y, exact, rtol=1e-9, atol=1e-12)
 
