@@ -37,6 +37,8 @@ _SMALL = 1e-6
 """Observed amplitude below every limit, gate and dead zone [-]; float32 actions keep their relative precision."""
 _SEEN = ("ring_error", "T_1", "v_p", "Q_H")
 """Channels through which the plant reaches the controller."""
+SEEN = [Measured._fields.index(name) for name in _SEEN]
+"""Their places in an observation."""
 _AT_REST = np.array([float(channel.name == "valid") for channel in MEASURED])
 """Observation at rest: zeros and a valid camera."""
 _DISTURBED = ("v_p", "Q_H", "camera")
@@ -137,15 +139,57 @@ def _answer(policy: Any, probes: Floats, rest: Any, free: Sequence[str], sizes: 
     return np.hstack([*(part[0] for name, part in _parts(moved).items() if name in free), action])
 
 
-def sampled_plant(puller: Puller, dt: float) -> StateSpace:
+class Lags(NamedTuple):
+    """Lags of a loop beyond the plant's own equations [s]; delays between whole samples are interpolated."""
+
+    latency: float = 0.0
+    """Latency of the camera."""
+    heater_lag: float = 0.0
+    """Time constant of the heater's power."""
+    heater_dead_time: float = 0.0
+    pyrometer_filter: float = 0.0
+    """Time constant of the pyrometer."""
+
+
+NO_LAGS = Lags()
+
+
+def sampled_plant(puller: Puller, dt: float, lags: Lags = NO_LAGS) -> StateSpace:
     """The plant with held inputs v_p, Q_H and outputs r_br, T_1; deviations in SI units."""
     A, B, C, _ = linearise(puller)
-    C = np.stack([C[OUTPUTS.index("r_br")], np.eye(len(STATES))[STATES.index("T_1")]])
-    A_d, B_d, *_ = cont2discrete((A, B[:, :2], C, np.zeros((2, 2))), dt, method="zoh")
-    return StateSpace(A_d, B_d, C, np.zeros((2, 2)))
+    B, C = B[:, :2], np.stack([C[OUTPUTS.index("r_br")], np.eye(len(STATES))[STATES.index("T_1")]])
+    if (tau := lags.heater_lag) > 0.0:
+        A = np.block([[A, B[:, 1:]], [np.zeros((1, len(A))), -np.eye(1) / tau]])
+        B, C = np.vstack([B * [1.0, 0.0], [0.0, 1.0 / tau]]), np.hstack([C, np.zeros((2, 1))])
+    if (tau := lags.pyrometer_filter) > 0.0:
+        A = np.block([[A, np.zeros((len(A), 1))], [C[1:] / tau, -np.eye(1) / tau]])
+        B, C = np.vstack([B, np.zeros((1, 2))]), np.hstack([C * [[1.0], [0.0]], [[0.0], [1.0]]])
+    A, B, *_ = cont2discrete((A, B, C, np.zeros((2, 2))), dt, method="zoh")
+    for delay, at_drive in ((lags.heater_dead_time, True), (lags.latency, False)):
+        if delay > 0.0:
+            A, B, C = _delayed(A, B, C, delay / dt, at_drive)
+    return StateSpace(A, B, C, np.zeros((2, 2)))
 
 
-def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -> Loop:
+def _delayed(A: Floats, B: Floats, C: Floats, samples: float, at_drive: bool) -> tuple[Floats, Floats, Floats]:
+    """A sampled plant whose heater, or whose ring, is late by a number of samples."""
+    whole = math.floor(samples + 1e-9)
+    part, n, length = max(samples - whole, 0.0), len(A), whole + (samples - whole > 1e-9)
+    shift, weights = np.eye(length, k=-1), np.zeros((1, length + 1))
+    weights[0, whole] = 1.0 - part
+    weights[0, length] += part
+    enters = np.eye(length, 1)
+    if at_drive:
+        heat = B[:, 1:]
+        A = np.block([[A, heat @ weights[:, 1:]], [np.zeros((length, n)), shift]])
+        B = np.vstack([np.hstack([B[:, :1], heat * weights[0, 0]]), np.hstack([0.0 * enters, enters])])
+        return A, B, np.hstack([C, np.zeros((2, length))])
+    A = np.block([[A, np.zeros((n, length))], [enters @ C[:1], shift]])
+    late = np.hstack([weights[0, 0] * C[:1], weights[:, 1:]])
+    return A, np.vstack([B, np.zeros((length, 2))]), np.vstack([late, np.hstack([C[1:], np.zeros((1, length))])])
+
+
+def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "", lags: Lags = NO_LAGS) -> Loop:
     """The loop of controller and plant.
 
     Inputs: v_p (added to the command), Q_H (heat that the controller does not see), camera noise; references held.
@@ -154,14 +198,14 @@ def close(controller: StateSpace, puller: Puller, dt: float, broken: str = "") -
     ``v_p``. ``broken="Q_H"`` opens it between heater and hot zone: the plant gets only the input ``Q_H``, and the
     controller sees its command applied. The state is (plant, last applied v_p and Q_H, controller).
     """
-    plant, n, inputs = sampled_plant(puller, dt), len(STATES), len(_DISTURBED)
-    at = [Measured._fields.index(name) for name in _SEEN]
+    plant, inputs = sampled_plant(puller, dt, lags), len(_DISTURBED)
+    n = len(plant.A)
     seen = np.zeros((len(_SEEN), n + 2))
     seen[0, :n], seen[1, :n] = plant.C[0] * (broken != "camera"), plant.C[1]
     seen[2, n], seen[3, n + 1] = 1.0, 1.0
     noise = np.zeros((len(_SEEN), inputs))
     noise[0, _DISTURBED.index("camera")] = 1.0
-    B, D = controller.B[:, at], controller.D[:, at]
+    B, D = controller.B[:, SEEN], controller.D[:, SEEN]
     command, direct = np.hstack([D @ seen, controller.C]), D @ noise
     pulls, heats = float(broken != "v_p"), float(broken != "Q_H")
     apply = np.vstack([plant.B @ np.diag([pulls, heats]), np.diag([pulls, 1.0])])

@@ -23,6 +23,7 @@ from cz_gym.support.units import MM, MM_PER_MIN
 
 from .analysis import close, linear_form
 from .lqg_filter import MEAN_RIPPLE
+from .margins import margin_of, worst_of
 from .pid import FilteredPID, SeriesPID
 from .policy import Floats
 from .scaling import PROPORTIONAL, factors, scale_pid
@@ -155,10 +156,9 @@ def _priced(pid: FilteredPID, config: Config, plant: _Plant) -> Any:
     default = DEFAULT.parameters.v_0
     for gain in (GAINS * plant.scale["gain"]).tolist():
         L, closed = gain * loop, 1.0 / (1.0 + gain * loop)
-        up, down, phase = (
-            f(each) for f, each in zip((min, max, min), zip(*map(margins_of, L), strict=True), strict=True)
-        )
-        if min(up, 1.0 / max(down, 1e-9)) < SPARE * GAIN_MARGIN or phase < SPARE * PHASE_MARGIN or up > 20.0:
+        worst = worst_of(margin_of(each, plant.omega) for each in L)
+        up, phase = worst.gain_up, worst.phase
+        if worst.gain < SPARE * GAIN_MARGIN or phase < SPARE * PHASE_MARGIN or up > 20.0:
             continue
         ring, pull = load * closed, gain * law * load * closed
         steps = gain * law * closed * (1.0 - 1.0 / plant.z) * plant.noise
@@ -169,28 +169,6 @@ def _priced(pid: FilteredPID, config: Config, plant: _Plant) -> Any:
         price = radius / (MM * config.puller.scale) + moves / plant.window
         price += STEP_PRICE * activity / (STEP * config.parameters.v_0 / default)
         yield replace(pid, pid=replace(pid.pid, K_p=gain)), price, (up, phase)
-
-
-def margins_of(L: Any) -> tuple[float, float, float]:
-    """Factors by which a loop's gain may grow and fall [-], and its phase margin [degrees], on a frequency grid."""
-    phase, gain = np.unwrap(np.angle(L)), np.log(np.abs(L))
-    past = np.mod(phase, 2.0 * np.pi) - np.pi
-    at = np.flatnonzero(((past[:-1] > 0.0) != (past[1:] > 0.0)) & (np.abs(np.diff(past)) < 1.0))
-    factors = np.exp(-_crossed(past, gain, at))
-    turned = _crossed(gain, phase, np.flatnonzero((gain[:-1] > 0.0) != (gain[1:] > 0.0)))
-    nearest = np.abs(np.mod(turned, 2.0 * np.pi) - np.pi).min(initial=np.pi)
-    return (
-        float(factors[factors > 1.0].min(initial=np.inf)),
-        float(factors[factors < 1.0].max(initial=0.0)),
-        float(np.degrees(nearest)),
-    )
-
-
-def _crossed(through_zero: Floats, other: Floats, at: Any) -> Floats:
-    """Another curve where one goes through zero between neighbours."""
-    share = through_zero[at] / (through_zero[at] - through_zero[at + 1])
-    values: Floats = other[at] + share * (other[at + 1] - other[at])
-    return values
 
 
 def _stable(pid: FilteredPID, config: Config) -> bool:
