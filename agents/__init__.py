@@ -11,7 +11,7 @@ from pathlib import Path
 
 from cz_gym.config import Config
 from cz_gym.crystal.process import ENVIRONMENTS
-from cz_gym.support.names import unknown_name_message
+from cz_gym.support.errors import unknown_name_message
 
 from .contract import AgentFileError, Contract, read_agent
 from .policy import OnnxPolicy

@@ -24,8 +24,7 @@ from torch.nn.functional import huber_loss
 from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.process import Channel
 from cz_gym.spaces import observations
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import require_type
+from cz_gym.support.errors import CzError, require_type
 
 GAINS = {
     "ring_error": 8.0, "integral": 4.0, "v_p": 8.0, "Q_H": 8.0, "r_c_error": 8.0, "h_c": 8.0, "T_b": 8.0, "dT_i": 2.0,

@@ -22,8 +22,8 @@ from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.user_code import scenarios
 from cz_gym.spaces import observations
 from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.errors import require_type
 from cz_gym.support.files import write_files
-from cz_gym.support.names import require_type
 
 from .contract import AgentFileError, Contract, agent_files
 from .policy import OnnxPolicy

@@ -34,9 +34,8 @@ from tqdm import tqdm
 
 from cz_gym.evaluation.parallel import run_parallel
 from cz_gym.sb3 import environment_steps
-from cz_gym.support.errors import CzError
+from cz_gym.support.errors import CzError, software
 from cz_gym.support.files import locked, write_files
-from cz_gym.support.names import software
 
 from . import validation
 from .asymmetric import Asymmetric, LearnState

@@ -26,8 +26,7 @@ from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.process import HEATER_SCALE, PULL_SCALE, scales
 from cz_gym.spaces import DRIVE_CHANNELS, HEATER_RANGE, MEASURED
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import leaves, map_arrays
+from cz_gym.support.errors import CzError, leaves, map_arrays
 
 from .lqg import LQG
 from .pid import Compensator, FilteredPID, SeriesPID

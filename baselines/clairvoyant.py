@@ -23,8 +23,7 @@ from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, Disturbance, Pulle
 from cz_gym.physics.schedule import bias_offset, reference
 from cz_gym.process import Inputs, scales
 from cz_gym.spaces import STATE, TargetEnv, tag
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import stack
+from cz_gym.support.errors import CzError, stack
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
 
 from .policy import Floats, batched, reset_rows, to_action

@@ -20,7 +20,7 @@ from cz_gym.body.signals import PREVIEWS, WEIGHTS, Measured, Weights, coefficien
 from cz_gym.config import Config
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.plant import Puller, make_puller
-from cz_gym.support.names import stack
+from cz_gym.support.errors import stack
 from cz_gym.support.units import KILO, MM_PER_MIN
 
 from .lqg_estimator import Hypotheses, MultipleModelFilter, PlantFilter, multiple_model_filter

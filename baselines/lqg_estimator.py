@@ -15,7 +15,7 @@ from cz_gym.body.signals import Measured
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, Disturbance, State, hidden_load, radius_limit, rk4
 from cz_gym.process import Inputs
-from cz_gym.support.names import map_arrays, select
+from cz_gym.support.errors import map_arrays, select
 from cz_gym.support.units import KILO, MINUTE
 
 from . import lqg_filter

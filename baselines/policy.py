@@ -20,8 +20,7 @@ from cz_gym.physics.plant import make_puller
 from cz_gym.process import Process
 from cz_gym.puller.file import DEFAULT, PullerFile
 from cz_gym.spaces import TargetEnv, decode, readable, tag
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import select
+from cz_gym.support.errors import CzError, select
 
 Floats = npt.NDArray[np.float64]
 

@@ -18,11 +18,9 @@ from cz_gym.episodes.draw import Factors
 from cz_gym.episodes.scenario import AnyScenario, Distribution, Scenario
 from cz_gym.episodes.scenarios import RANDOMIZED, adapt_scenario, find_distribution, find_scenario, mix_of
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
-from cz_gym.physics.parameters import Parameters
-from cz_gym.physics.quantities import Range
+from cz_gym.physics.parameters import Parameters, Range
 from cz_gym.puller.file import DEFAULT, PullerFile, find_puller
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import require_type, unknown_name_message
+from cz_gym.support.errors import CzError, require_type, unknown_name_message
 
 from .process import Inputs, Process
 from .spaces import ACTIONS, CAMERA, OBSERVATIONS, TargetEnv

@@ -24,8 +24,7 @@ from cz_gym.engine.slots import Out, check_info
 from cz_gym.episodes.scenario import Distribution, Mixture
 from cz_gym.rendering.canvas import Frame
 from cz_gym.rendering.view import FPS, View, declared_modes, make_view
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import check_keywords, unknown_name_message
+from cz_gym.support.errors import CzError, check_keywords, unknown_name_message
 
 from .config import Config, check_config, make_config, positive_whole
 from .spaces import TaggedAction, action_space, check_action, check_actions, check_tagged, observation_space

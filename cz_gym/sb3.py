@@ -16,8 +16,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_wrapper
 
 from cz_gym.crystal.process import ENVIRONMENTS
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import require_type, unknown_name_message
+from cz_gym.support.errors import CzError, require_type, unknown_name_message
 
 from .env import CzVectorEnv, EnvState
 from .spaces import observations

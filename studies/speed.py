@@ -22,8 +22,8 @@ from cz_gym.engine.batch import Batch, processors
 from cz_gym.engine.tangents import DifferentiableBatch
 from cz_gym.env import CzEnv, CzVectorEnv
 from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.errors import software
 from cz_gym.support.files import check_writable, write_files
-from cz_gym.support.names import software
 
 from .common import to_json
 

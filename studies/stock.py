@@ -16,9 +16,8 @@ from cz_gym.agents.from_sb3 import ALGORITHMS
 from cz_gym.agents.validation import JUDGING_SEEDS, validate
 from cz_gym.config import make_config
 from cz_gym.support.command_line import between
-from cz_gym.support.errors import CzError
+from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.files import write_files
-from cz_gym.support.names import unknown_name_message
 from cz_gym.tools.registry import make_controller
 from cz_gym.tools.report.tables import markdown
 

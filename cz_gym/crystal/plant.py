@@ -12,8 +12,7 @@ from cz_gym.jit import force_inlined, jittable, joined, labelled
 from cz_gym.physics.numerics import clip
 from cz_gym.physics.parameters import CrystalRecipe, Parameters, check_numbers, check_parameters
 from cz_gym.physics.plant import Puller, derive_puller, heating, interface
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown_name_message
+from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.units import MM
 
 STAGES = ("crown", "body", "tail", "whole")

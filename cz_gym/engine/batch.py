@@ -22,7 +22,7 @@ from cz_gym.config import Config, Identity
 from cz_gym.episodes.draw import ScenarioTable, scenario_table
 from cz_gym.episodes.scenario import GRID, Distribution, series_table
 from cz_gym.jit import entry
-from cz_gym.physics.quantities import MAX_DEAD_TIME, MAX_LATENCY
+from cz_gym.physics.parameters import MAX_DEAD_TIME, MAX_LATENCY
 from cz_gym.process import NO_OPERATING_POINT, scales
 from cz_gym.spaces import drives_of, lags, observations
 from cz_gym.support.errors import CzError

@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.jit import jittable, kernel
-from cz_gym.physics.parameters import Parameters
-from cz_gym.physics.quantities import Range
+from cz_gym.physics.parameters import Parameters, Range
 from cz_gym.physics.schedule import DRAW_SPAN
 
 from .rng import WORDS, normal, seed_stream, two_normals, uniform

@@ -2,7 +2,7 @@
 
 A range is a pair ``(low, high)`` of a uniform distribution, in SI units; ``(x, x)`` is the value x. A family
 left at its default is absent. Two scenarios with equal contents have equal :attr:`Scenario.hash`. The range of each
-number is its :class:`cz_gym.physics.quantities.Quantity`'s; what belongs to the machine is in its table.
+number is its :class:`cz_gym.physics.parameters.Quantity`'s; what belongs to the machine is in its table.
 """
 
 import csv
@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.physics.quantities import MACHINE, MAX_DEAD_TIME, Quantity, Range
+from cz_gym.physics.parameters import MACHINE, MAX_DEAD_TIME, Quantity, Range
 from cz_gym.physics.schedule import DRAW_SPAN
 from cz_gym.support.errors import CzError
 

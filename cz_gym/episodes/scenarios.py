@@ -8,10 +8,9 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
-from cz_gym.physics.quantities import Quantity
+from cz_gym.physics.parameters import Quantity
 from cz_gym.puller.file import DEFAULT, PullerFile, value_of
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown_name_message
+from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 from .scenario import (

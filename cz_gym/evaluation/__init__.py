@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cz_gym.support.errors import require_type
 from cz_gym.support.files import write_files
-from cz_gym.support.names import require_type
 from cz_gym.support.units import MM
 
 from .rollout import Rollout

@@ -15,8 +15,7 @@ from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.process import Process
 from cz_gym.puller.file import DEFAULT, PullerFile
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown_name_message
+from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.units import MM, MM_PER_MIN
 
 REWARD, STATE, PLANT = "reward", "state", "plant"

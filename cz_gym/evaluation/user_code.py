@@ -11,8 +11,7 @@ from typing import Any, Self
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Distribution, Scenario
 from cz_gym.episodes.scenarios import SCENARIOS, find_distribution, find_scenario
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown_name_message
+from cz_gym.support.errors import CzError, unknown_name_message
 
 from .protocol import Case, Contender
 

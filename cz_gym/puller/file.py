@@ -1,6 +1,6 @@
 """A puller as a file: TOML with the unit in every key, from and to numbers in SI units.
 
-Keys are those of :data:`cz_gym.physics.quantities.MACHINE`, from which reader, writer, errors and the page's table
+Keys are those of :data:`cz_gym.physics.parameters.MACHINE`, from which reader, writer, errors and the page's table
 follow. A number is read exactly (decimal text times the unit's size, rounded once), and written with the fewest digits
 that read back the same.
 """
@@ -20,13 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.physics.parameters import CrystalRecipe, Parameters, check_parameters
+from cz_gym.physics.parameters import MACHINE, CrystalRecipe, Parameters, Quantity, Range, check_parameters
 from cz_gym.physics.plant import RADIUS_LIMIT, check_height, make_puller
-from cz_gym.physics.quantities import MACHINE, Quantity, Range
 from cz_gym.process import HEATER_SCALE
-from cz_gym.support.errors import CzError
+from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.files import name_file_in_errors, write_files
-from cz_gym.support.names import unknown_name_message
 from cz_gym.support.units import CELSIUS, KILO, MM
 
 FORMAT = 1

@@ -10,8 +10,7 @@ from gymnasium.error import DependencyNotInstalled, Error, ResetNeeded
 from cz_gym.body.process import BODY
 from cz_gym.config import Config
 from cz_gym.process import Process
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown_name_message
+from cz_gym.support.errors import CzError, unknown_name_message
 
 from .canvas import MISSING, Frame, available, load
 from .picture import DRAWN, Picture, Record, record_for

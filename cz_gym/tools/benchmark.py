@@ -11,8 +11,7 @@ from cz_gym.evaluation import user_code
 from cz_gym.evaluation.protocol import SLOW_EPISODES, Case, Contender, agent, find_case
 from cz_gym.puller.file import chosen_puller
 from cz_gym.support.command_line import OneLineParser, between, relative_path, run_command
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown_name_message
+from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.units import MM
 from cz_gym.tools.report.markdown import terminal
 

@@ -36,9 +36,8 @@ from cz_gym.evaluation.rollout import informed, rollout
 from cz_gym.puller.file import DEFAULT, PullerFile, chosen_puller, to_toml
 from cz_gym.spaces import DRIVE_CHANNELS, drives_of, to_measured
 from cz_gym.support.command_line import OneLineParser, between
-from cz_gym.support.errors import CzError
+from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.files import check_writable
-from cz_gym.support.names import unknown_name_message
 from cz_gym.tools.identify.moves import Excited
 from cz_gym.tools.registry import CONTROLLERS
 

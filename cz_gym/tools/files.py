@@ -10,9 +10,8 @@ from typing import Any
 from cz_gym.evaluation.metrics import OUTSIDE
 from cz_gym.evaluation.protocol import BOUND, REFERENCE, Case
 from cz_gym.evaluation.statistics import RESAMPLES, SEED, Estimate
-from cz_gym.support.errors import CzError
+from cz_gym.support.errors import CzError, software
 from cz_gym.support.files import check_writable, name_file_in_errors, write_files
-from cz_gym.support.names import software
 
 from .episodes import Benchmark, to_csv
 from .report.task_records import contract_hash

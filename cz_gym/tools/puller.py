@@ -8,9 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from cz_gym.body.process import STATES, linearise, radius_model
-from cz_gym.physics.parameters import Parameters
+from cz_gym.physics.parameters import MACHINE, Parameters
 from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, make_puller
-from cz_gym.physics.quantities import MACHINE
 from cz_gym.puller.file import PullerFile, defaults_of, doubts, find_puller, value_of
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.units import CELSIUS, HOUR, KILO, MINUTE, MM, MM_PER_MIN

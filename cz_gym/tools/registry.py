@@ -27,8 +27,7 @@ from cz_gym.config import Config, check_config
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.evaluation.protocol import Contender, unchanged
 from cz_gym.process import Process
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown_name_message
+from cz_gym.support.errors import CzError, unknown_name_message
 
 
 def _changed(change: Callable[[LQG], Policy], tuned: TunedController, config: Config) -> Policy:

@@ -21,9 +21,8 @@ from cz_gym.evaluation.parallel import run_parallel
 from cz_gym.evaluation.protocol import BOUND, SLOW_EPISODES, Case, Contender
 from cz_gym.evaluation.rollout import check_policy, rollout
 from cz_gym.jit import PACKAGE, compiled_sources, hash_files
-from cz_gym.support.errors import CzError
+from cz_gym.support.errors import CzError, software
 from cz_gym.support.files import write_files
-from cz_gym.support.names import software
 
 from .episodes import CODE, CONTRACT, GAPS, KEYS, Benchmark, read_episodes, to_csv, values_of
 from .report.task_records import contract_hash, task_of

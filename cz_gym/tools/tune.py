@@ -20,8 +20,7 @@ from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.evaluation.parallel import run_parallel
 from cz_gym.puller.file import FOLDER, PullerFile, chosen_puller
 from cz_gym.support.command_line import OneLineParser, between, relative_path
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown_name_message
+from cz_gym.support.errors import CzError, unknown_name_message
 
 TUNABLE: dict[str, TunedController] = {each.name: each for each in (*PIDS, *LQGS, *CRYSTALS)}
 Task = tuple[TunedController, PullerFile, int, int, Path]

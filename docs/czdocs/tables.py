@@ -18,8 +18,7 @@ from cz_gym.camera.view import Camera
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.episodes.scenario import FAMILIES
 from cz_gym.episodes.scenarios import RANDOMIZED
-from cz_gym.physics.parameters import describe
-from cz_gym.physics.quantities import MACHINE, Quantity
+from cz_gym.physics.parameters import MACHINE, Quantity, describe
 from cz_gym.process import PULL_SCALE, Channel
 from cz_gym.puller.file import DEFAULT, value_of
 from cz_gym.spaces import HISTORY, LAGGED, LAGS, MEASURED, STATE

@@ -14,7 +14,7 @@ from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.spaces import decode
-from cz_gym.support.names import map_arrays
+from cz_gym.support.errors import map_arrays
 from cz_gym.support.units import HOUR, MM
 from cz_gym.tools.registry import make_controller
 from tests.observed import PLAIN, Watched, measured

@@ -17,8 +17,7 @@ from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.spaces import MEASURED
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import map_arrays
+from cz_gym.support.errors import CzError, map_arrays
 from cz_gym.tools.export.controllers import make_block
 from cz_gym.tools.registry import CONTROLLERS, CRYSTAL_CONTROLLERS, TASKS, find_controller, make_controller
 from tests.observed import PLAIN, actions_of, measured

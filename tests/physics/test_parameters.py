@@ -5,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cz_gym import Parameters, make_puller
-from cz_gym.physics.parameters import check_parameters
-from cz_gym.physics.quantities import MACHINE, SIZES
+from cz_gym.physics.parameters import MACHINE, SIZES, check_parameters
 
 REFUSED = [
     ({"alpha_0": 11.0}, r"did you mean 0.191986 \(11 deg\)"),

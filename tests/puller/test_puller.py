@@ -12,8 +12,7 @@ from cz_gym.config import Config, make_config
 from cz_gym.engine.tangents import DifferentiableBatch
 from cz_gym.env import CzEnv
 from cz_gym.episodes.scenarios import ALL, HARD, PULLER, RANDOMIZED, adapt_scenario
-from cz_gym.physics.parameters import CrystalRecipe, Parameters
-from cz_gym.physics.quantities import MACHINE
+from cz_gym.physics.parameters import MACHINE, CrystalRecipe, Parameters
 from cz_gym.puller.file import (
     DEFAULT,
     FOLDER,

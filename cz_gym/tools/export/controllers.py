@@ -22,8 +22,7 @@ from cz_gym.engine.kernels import update_history, write_history
 from cz_gym.process import scales
 from cz_gym.puller.file import DEFAULT
 from cz_gym.spaces import CLIP, HEATER_SLACK, HISTORY, INTEGRAL_SCALE, LAGGED, MEASURED, drives_of, lags
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown_name_message
+from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.tools.registry import CONTROLLERS
 
 from .shell import Block

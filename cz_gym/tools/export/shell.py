@@ -25,7 +25,7 @@ from cz_gym.body.process import STATES, linearise
 from cz_gym.body.signals import Measured
 from cz_gym.config import Config
 from cz_gym.spaces import TargetEnv, decode, tag
-from cz_gym.support.names import select
+from cz_gym.support.errors import select
 from cz_gym.support.units import KILO, MINUTE, MM_PER_MIN
 
 from .block import (

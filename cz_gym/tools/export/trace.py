@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import leaves, map_arrays
+from cz_gym.support.errors import CzError, leaves, map_arrays
 
 Floats = npt.NDArray[np.float64]
 Ids = npt.NDArray[np.int64]

@@ -14,8 +14,7 @@ from scipy.optimize import least_squares, minimize
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters
 from cz_gym.puller.file import DEFAULT, PullerFile
-from cz_gym.support.errors import CzError
-from cz_gym.support.names import unknown_name_message
+from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.units import KILO, MM
 
 from .log import Floats, Log, join_logs, prepare, shift_drives

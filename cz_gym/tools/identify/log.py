@@ -19,9 +19,8 @@ import numpy.typing as npt
 from cz_gym.physics.plant import make_puller
 from cz_gym.puller.file import PullerFile
 from cz_gym.spaces import decode
-from cz_gym.support.errors import CzError
+from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.files import name_file_in_errors, write_files
-from cz_gym.support.names import unknown_name_message
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 
 Units = dict[str, tuple[float, float]]

@@ -31,9 +31,8 @@ from cz_gym.env import CzEnv, EnvState
 from cz_gym.rendering.canvas import Frame
 from cz_gym.rendering.view import record_of
 from cz_gym.spaces import CLIP, decode
-from cz_gym.support.errors import CzError
+from cz_gym.support.errors import CzError, leaves, map_arrays
 from cz_gym.support.files import check_writable, name_file_in_errors, write_files
-from cz_gym.support.names import leaves, map_arrays
 from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN
 from cz_gym.tools.export.block import INPUTS, OUTPUTS, SETPOINT_NAMES, in_plant_units, settings_of
 from cz_gym.tools.export.controllers import FALLBACK, make_block
