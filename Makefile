@@ -19,7 +19,7 @@ BROWSER_READY := $(VENV)/.ready-browser
 # A worker that runs out of tests takes some of the other's: files differ too much in time to be dealt out whole.
 IN_PARALLEL := --numprocesses auto --dist worksteal
 
-.PHONY: help venv lint types test test-all test-lowest test-newest test-wheel audit lock test-browser benchmark benchmark-full paper docs tables notebooks clean
+.PHONY: help venv lint types test test-all stress test-lowest test-newest test-wheel audit lock test-browser benchmark benchmark-full paper docs tables notebooks clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -41,10 +41,13 @@ types: $(TEST_READY) ## strict types
 
 # Types are checked while tests run: a worker waits for the other's compiled code, and the last tests for one processor.
 test: lint ## lint, types and the fast tests, in minutes
-	($(MYPY)) & $(BIN)/python -m pytest -q -m "not slow" $(IN_PARALLEL); tests=$$?; wait $$! && exit $$tests
+	($(MYPY)) & $(BIN)/python -m pytest -q -m "not slow" --ignore tests/stress $(IN_PARALLEL); tests=$$?; wait $$! && exit $$tests
 
-test-all: lint ## lint, types and all tests: kills, cold compiles, wheels and long campaigns too
+test-all: lint ## lint, types and all tests: cold compiles, wheels, damaged files and kills too
 	($(MYPY)) & $(BIN)/python -m pytest -q $(IN_PARALLEL); tests=$$?; wait $$! && exit $$tests
+
+stress: $(TEST_READY) ## damaged files and killed runs alone; test-all has them too
+	$(BIN)/python -m pytest -q tests/stress
 
 # Old packages warn about the new ones beneath them, which is not this project's to mend: warnings are no errors there.
 test-lowest: ## the tests on the lowest versions that pyproject.toml allows

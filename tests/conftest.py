@@ -5,6 +5,7 @@ Where an optional package is not installed, the tests that need it are skipped, 
 
 import importlib.util
 import os
+import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -20,6 +21,7 @@ from hypothesis import settings
 from cz_gym.support.command_line import OPTIONAL
 
 os.environ["SDL_VIDEODRIVER"] = os.environ["SDL_AUDIODRIVER"] = "dummy"  # no test opens a window
+ROOT = Path(__file__).parents[1]
 CACHE = Path(os.environ["CZ_GYM_CACHE_DIR"])
 
 settings.register_profile("repeatable", deadline=None, derandomize=True, database=None, max_examples=40)
@@ -47,6 +49,13 @@ def pytest_sessionstart():
             env = CzEnv(observation="camera")
             env.reset(seed=0)
             env.step(np.zeros(2, np.float32))
+
+
+def python(*arguments: str, cwd: Path = ROOT, env: dict[str, str] | None = None) -> str:
+    """The output of Python with these arguments; its exit code must be 0."""
+    done = subprocess.run([sys.executable, *arguments], cwd=cwd, env=env, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
 
 def lacks(error):

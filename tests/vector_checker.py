@@ -1,6 +1,6 @@
 """Comparison of a native vector environment with Gymnasium's vector of its scalar form, in every autoreset mode.
 
-Further checks show that returned arrays are never written or read again. ``tests/test_vector_checker.py`` breaks
+Further checks show that returned arrays are never written or read again. ``tests/environment/test_vector.py`` breaks
 Gymnasium's own vector in each of these ways.
 """
 

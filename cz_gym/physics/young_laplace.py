@@ -12,7 +12,7 @@ the solution as polynomials that compile into the step::
 
 The coefficients in ``young_laplace.json`` interpolate solutions by shooting at the Chebyshev points of both variables,
 turned into powers: ``SLOPE`` corrects :func:`lift`, ``RING`` and ``TAIL`` correct :func:`exact_ring_offset`. A test
-solves the equation again and compares (``tests/physics/test_young_laplace.py``).
+solves the equation again and compares (``tests/physics/test_meniscus.py``).
 """
 
 import json

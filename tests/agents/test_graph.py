@@ -13,8 +13,8 @@ from cz_gym.agents.graph import MAX_ACTIVATIONS, MAX_NODES, OPERATORS, check_gra
 from cz_gym.config import make_config
 from cz_gym.spaces import MEASURED
 from tests import contracts
+from tests.conftest import python
 from tests.contracts import LINEAR, facts, graph_of, value
-from tests.processes import python
 
 CHANNELS = len(MEASURED)
 WEIGHTS = {"weight": np.full((CHANNELS, 2), 0.01, np.float32), "bias": np.zeros(2, np.float32)}

@@ -1,4 +1,4 @@
-"""Training runs: what they leave, that they go on where they stopped, and answer mistakes in one line."""
+"""Training: recipes, validation, what runs leave, that they go on where they stopped, and mistakes in one line."""
 
 import csv
 import io
@@ -8,19 +8,25 @@ import math
 import os
 import signal
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 
+import numpy as np
 import pytest
 import torch
 from tqdm import tqdm
 
+from cz_gym import CzEnv
 from cz_gym.agents import AgentFileError, OnnxPolicy, load, validation
 from cz_gym.agents import train as training
-from cz_gym.agents.recipes import CRYSTAL_RECIPES, RECIPES, make_algorithm
+from cz_gym.agents.recipes import CRYSTAL_RECIPES, PPO, RECIPES, make_algorithm
 from cz_gym.agents.train import CHECKPOINT, TrainingRun, load_checkpoint, restore, to_bytes
 from cz_gym.config import make_config
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
+from cz_gym.evaluation.rollout import rollout
 from cz_gym.support.command_line import interpreter
 from cz_gym.tools import train
+from cz_gym.tools.registry import make_controller
 from tests.small_learners import QUICK, REFERENCES, SMALL, SMALL_APG, SMALL_SAC, SmallRun, learned, train_small, trained
 
 ALONG = {name: getattr(CRYSTAL_RECIPES["ppo"], name) for name in ("environment", "stages", "scenario")}
@@ -310,3 +316,65 @@ def test_processes_train_the_same(tmp_path, monkeypatch):
             assert bar.n == pytest.approx(3)
         monkeypatch.setattr(training, "run_parallel", in_turn)
     assert agents(tmp_path / "there") == agents(tmp_path / "here")
+
+
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_no_two_training_seeds_meet_the_same_crystals(name):
+    recipe = replace(RECIPES[name], num_envs=8, hidden=(4,), batch_size=64)
+    met = []
+    for seed, done in ((0, 0), (1, 0), (2, 0), (1, 327_680)):
+        env = make_algorithm(recipe, seed, done).env
+        met.append({int(each) for each in env.unwrapped._seeds})
+        env.close()
+    assert [len(each) for each in met] == [8] * 4
+    assert len(set.union(*met)) == 4 * 8
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_the_numbers_of_a_recipe_reach_its_algorithm(name):
+    recipe = replace(RECIPES[name], num_envs=64)
+    algorithm = make_algorithm(recipe, 0)
+    given = 0
+    for field, wanted in asdict(recipe).items():
+        found = getattr(algorithm, f"{field}_schedule", getattr(algorithm, field, None))
+        if isinstance(wanted, (int, float, tuple)) and found is not None and field != "learning_rate":
+            given += 1
+            assert (found(1.0) if callable(found) else found) == wanted, field
+    assert given >= 1
+
+
+@pytest.mark.parametrize(("name", "batch"), [("ppo", 174), ("sac", 125)])
+def test_a_small_budget_has_fewer_crystals_and_smaller_batches(name, batch):
+    recipe, small = RECIPES[name], RECIPES[name].with_steps(2_000_000)
+    assert (small.steps, small.batch_size) == (2_000_000, batch)
+    assert small.num_envs < recipe.num_envs
+    assert small.updates == pytest.approx(recipe.fewest_updates, rel=0.02)
+    assert recipe.with_steps(recipe.steps) == recipe
+
+
+SEEDS = range(1_000_000, 1_000_006)
+
+
+def test_crystals_that_judge_neither_select_nor_test():
+    judged = set(validation.JUDGING_SEEDS)
+    assert judged <= set(VALIDATION_SEEDS)
+    assert not judged & (set(validation.SELECTION_SEEDS) | set(TEST_SEEDS))
+
+
+@pytest.mark.parametrize("scenario", ["randomized", "randomized=0.4,hard=0.2,puller=0.4"])
+def test_a_reference_has_its_design_for_each_crystal(scenario, monkeypatch):
+    monkeypatch.setattr(validation, "SELECTION_SEEDS", SEEDS)
+    monkeypatch.setattr(validation, "JUDGING_SEEDS", SEEDS[:1])
+    monkeypatch.setattr(validation, "REFERENCES", {"Cz-v0": ("paper-tuned",)})
+    recipe = replace(PPO(), scenario=scenario)
+    config = replace(recipe.config, observation="measured", action="direct")
+    errors, drawn = [], set()
+    for seed in SEEDS:
+        env = CzEnv.from_config(config)
+        name = env.reset(seed=seed)[1].get("scenario", "randomized")
+        own = config.with_scenario(name)
+        errors.append(metrics(rollout(make_controller("paper-tuned", own), own, [seed])).rmse_mm[0])
+        drawn.add(name)
+    found = validation.references(make_controller, recipe)
+    assert found == {"paper-tuned": pytest.approx((np.mean(errors), errors[0]), rel=1e-12)}
+    assert len(drawn) == (1 if scenario == "randomized" else 3)

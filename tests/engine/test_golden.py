@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from cz_gym import SCENARIOS, CzVectorEnv, Parameters
+from tests.conftest import ROOT, python
 from tests.golden.digest import digest
 from tests.golden.trajectories import FILE, SIGNALS, trajectories, trajectory
 from tests.observed import PLAIN
-from tests.processes import ROOT, python
 
 GOLDEN = json.loads(FILE.read_text())
 

@@ -11,9 +11,7 @@ from cz_gym.physics.plant import HEIGHT_MIN, Disturbance, State, rk4
 from cz_gym.process import Inputs
 from tests.equations import Truth, integrated
 from tests.observed import PLAIN
-from tests.stress.__main__ import WIDE, campaign, cases
-from tests.stress.adversaries import KINDS, Adversaries
-from tests.stress.checks import Broken, Watch
+from tests.stress.__main__ import KINDS, WIDE, Adversaries, Broken, Watch, campaign, cases
 
 MM = 1e-3
 

@@ -15,7 +15,7 @@ from cz_gym.config import make_config
 from cz_gym.engine.kernels import build_kernels
 from cz_gym.jit import CachedCode, Store, cache_folder, hash_files, jittable, kernel, source_hash
 from cz_gym.physics.meniscus import hurle_height
-from tests.processes import ROOT, python
+from tests.conftest import ROOT, python
 
 FACTOR = """
 from cz_gym import SCENARIOS

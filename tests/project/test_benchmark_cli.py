@@ -29,9 +29,9 @@ from cz_gym.tools import benchmark, run
 from cz_gym.tools.episodes import read_episodes, values_of
 from cz_gym.tools.files import check_targets
 from cz_gym.tools.registry import CONTROLLERS
+from tests.conftest import python
 from tests.contracts import LINEAR, facts, model_of
 from tests.observed import PLAIN
-from tests.processes import python
 
 FILES = ["benchmark.json", "crystal.png", "episodes.csv", "pareto.png", "report.html", "report.md"]
 SMALL = ["--episodes", "3", "--scenarios", "randomized,reference-b", "--controllers", "open-loop,paper"]

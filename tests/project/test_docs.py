@@ -7,12 +7,14 @@ blocks and within lines, are parsed by the program they name; shell blocks marke
 import importlib
 import inspect
 import re
+import runpy
 import shlex
 import tomllib
 from argparse import ArgumentParser
 from contextlib import suppress
 
 import myst_parser  # noqa: F401
+import nbformat
 import pytest
 import sybil
 from markdown_it import MarkdownIt
@@ -21,7 +23,7 @@ from sybil.parsers.markdown import CodeBlockParser
 import cz_gym_command
 from cz_gym import CzEnv
 from cz_gym.physics.parameters import describe
-from tests.processes import ROOT, python
+from tests.conftest import ROOT, python
 
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "results" / "README.md", *sorted(DOCS.rglob("*.md"))]
@@ -228,3 +230,15 @@ def test_every_symbol_has_unit_meaning_and_a_numbered_equation(monkeypatch):
             assert row.equations, f"{row.code}: no numbered equation of docs/physics.md holds {row.symbol}"
     sources = {row.code: row.source for row in nomenclature.parameters()}
     assert sources == {name: quantity.source for name, quantity in describe().items()}
+
+
+def test_the_example_pages_become_notebooks(tmp_path):
+    made = runpy.run_path(str(DOCS / "notebooks.py"))
+    for page, file in zip(made["PAGES"], made["write"](tmp_path), strict=True):
+        notebook = nbformat.read(file, as_version=4)
+        nbformat.validate(notebook)
+        code = [compile(cell.source, str(file), "exec") for cell in notebook.cells if cell.cell_type == "code"]
+        assert len(code) == (DOCS / f"{page}.md").read_text().count("```python")
+        text = "".join(cell.source for cell in notebook.cells if cell.cell_type == "markdown")
+        for link in re.findall(r"\]\(([^)#:]+)[)#]", text):
+            assert (tmp_path / link).exists(), link

@@ -8,7 +8,7 @@ from graphlib import CycleError, TopologicalSorter
 
 import pytest
 
-from tests.processes import ROOT, python
+from tests.conftest import ROOT, python
 
 ROOMS = (
     *("cz_gym.support", "cz_gym.jit", "cz_gym.process", "cz_gym.physics", "cz_gym.puller", "cz_gym.episodes"),

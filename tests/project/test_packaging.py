@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 import cz_gym
+from tests.conftest import ROOT, python
 from tests.golden.digest import digest
-from tests.processes import ROOT, python
 
 SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT = SETTINGS["project"]

@@ -1,4 +1,4 @@
-"""The command that redoes Part II: its numbers against published and analytic ones, its files, its errors."""
+"""Part II redone, and the Bode plot of any controller: published and analytic numbers, files, errors."""
 
 import json
 from pathlib import Path
@@ -9,8 +9,12 @@ from scipy.signal import lfilter
 
 from cz_gym import make_puller
 from cz_gym.baselines import CompensatedPID
+from cz_gym.baselines.analysis import loop_margins
 from cz_gym.baselines.pid import SeriesPID
 from cz_gym.body.process import radius_model
+from cz_gym.process import PULL_SCALE
+from cz_gym.support.units import MM
+from studies import bode
 from studies.paper import __main__ as paper
 from studies.paper.experiments import BARE, errors, inverse_response, pull_change, ramp, ramp_numbers, trace
 from studies.paper.figures import FIGURES
@@ -82,3 +86,56 @@ def test_compensated_measurement_is_what_the_controller_saw():
     integral = lfilter([0.5 * dt / pid.T_i, 0.5 * dt / pid.T_i], [1.0, -1.0], lead)
     expected = run.signals.v_p[0] + pid.K_p * (lead + integral)
     np.testing.assert_allclose(run.signals.v_p[1:], expected[:-1], atol=1e-3 * run.signals.v_p[0])
+
+
+OWN = """
+import numpy as np
+class Forgetful:
+    gains = [0.0, 0.0]
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.outer(np.atleast_2d(observation)[:, 0], self.gains), state
+class Gain(Forgetful):
+    gains = [0.02, 0.0]
+"""
+
+
+def test_a_controllers_margins_are_the_design_tables(tmp_path, capsys):
+    assert bode.main(["lqg", "--out", str(tmp_path / "lqg.png")]) == 0
+    assert (tmp_path / "lqg.png").read_bytes().startswith(b"\x89PNG")
+    form = bode.form_of("lqg")
+    expected = loop_margins(form.controller, make_puller(lam=0.5), form.dt)
+    assert f"| ring | {expected.crossover:.2e} | {expected.gain_up:.3g} |" in capsys.readouterr().out
+
+
+def test_phases_are_read_against_minus_180_degrees():
+    """The phase above -180 degrees at a gain of one is python-control's phase margin."""
+    form, puller = bode.form_of("paper"), make_puller(lam=1.0)
+    omega, found = bode.frequencies(form.dt), loop_margins(form.free, puller, form.dt, "v_p")
+    phase = bode.phase_of(bode.response(bode.opened(form.free, puller, form.dt, "v_p"), form.dt, omega))
+    assert -360.0 <= phase[0] < 0.0
+    at = np.argmin(np.abs(np.log(omega / found.crossover)))
+    assert phase[at] + 180.0 == pytest.approx(found.phase_deg, abs=1.0)
+
+
+def test_a_gain_alone_in_a_file_of_one_s_own_needs_neither_memory_nor_interval(tmp_path):
+    (tmp_path / "my.py").write_text(OWN)
+    form = bode.form_of(f"{tmp_path / 'my.py'}:Gain")
+    assert (form.dt, form.controller.A.shape) == (5.0, (0, 0))
+    assert form.controller.D[0, 0] == pytest.approx(0.02 * PULL_SCALE / MM)
+    assert loop_margins(form.controller, make_puller(), form.dt).crossover > 0.0
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["lqgg"], "did you mean 'lqg'"),
+        (["open-loop"], "there is no loop"),
+        (["my.py:Forgetful"], "there is no loop: nothing"),
+        (["nowhere.py:Mine"], "no such file"),
+        (["lqg", "--mix", "2"], "must lie in"),
+    ],
+)
+def test_a_controller_without_a_bode_plot_is_refused_in_one_line(given, said, tmp_path, monkeypatch, refused):
+    (tmp_path / "my.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    assert said in refused(bode.main, given)

@@ -19,7 +19,7 @@ import pytest
 from cz_gym.tools.export.block import SETPOINT_NAMES
 from cz_gym.tools.identify.log import read_log
 from cz_gym.tools.serve import command
-from tests.processes import ROOT
+from tests.conftest import ROOT
 from tests.tools.serve.conftest import PASSWORD, answer, connected, free_port, running, with_client
 
 from asyncua import ua  # isort: skip

@@ -1,20 +1,30 @@
-"""The verdict: one sentence on who holds the radius best where, and a table, a row a scenario."""
+"""Verdict and figures: who holds the radius best where, who is shown when there are many."""
 
+import io
 from dataclasses import replace
 from types import SimpleNamespace
 
 import pandas as pd
+import pytest
+from PIL import Image
 
+from cz_gym.baselines import OpenLoop
+from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.evaluation.protocol import Case
+from cz_gym.evaluation.plots import COLOURS, COLUMNS, DPI, styles_of
+from cz_gym.evaluation.protocol import Case, find_case
+from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.statistics import Estimate
 from cz_gym.tools.episodes import ESTIMATES
+from cz_gym.tools.registry import CONTROLLERS
 from cz_gym.tools.report import tables, task_records
-from cz_gym.tools.report.tables import FEWEST, best_of_each_kind
+from cz_gym.tools.report.figures import NAMED, draw_figures
+from cz_gym.tools.report.markdown import brief
+from cz_gym.tools.report.tables import FEWEST, best_of_each_kind, chosen
 from cz_gym.tools.report.task_records import body_verdict as verdict
 from cz_gym.tools.report.task_records import crystal_verdict
-from tests import samples
-from tests.samples import contender, joined
+from tests.observed import PLAIN
+from tests.samples import contender, joined, made, rolled_out
 
 BETTER, WORSE, EITHER = Estimate(-1.0, (-2.0, -0.5), 9), Estimate(1.0, (0.5, 2.0), 9), Estimate(0.1, (-1.0, 1.0), 9)
 
@@ -24,7 +34,7 @@ def line(case, name, kind, estimate, against="", metric="rmse_mm"):
     return case, name, metric, kind, against, estimate.mean, low, high, estimate.n
 
 
-def made(**scenarios):
+def differing(**scenarios):
     """Results of agents a, b, ...; each scenario gives their differences, "single" a scenario of one crystal.
 
     The rival has an RMSE of 5 mm; b knew the plant in training.
@@ -36,7 +46,7 @@ def made(**scenarios):
     for name, differences in scenarios.items():
         crystals = 1 if name.startswith("single") else FEWEST
         case = Case(name, "nominal" if crystals == 1 else "randomized", "")
-        parts.append(samples.made(case, *((each, {"rmse_mm": [0.0] * crystals}) for each in who[: most + 1])))
+        parts.append(made(case, *((each, {"rmse_mm": [0.0] * crystals}) for each in who[: most + 1])))
         lines.append(line(name, "lqg", "mean", Estimate(5.0, (4.0, 6.0), 9)))
         for agent, each in zip("abc", differences, strict=False):
             lines.append(line(name, agent, "mean", Estimate(5.0 + each.mean, None, 9)))
@@ -49,7 +59,7 @@ def made(**scenarios):
 
 def test_the_sentence_says_which_kind_holds_the_radius_best_and_where():
     def said(**scenarios):
-        return verdict(made(**scenarios)).sentence
+        return verdict(differing(**scenarios)).sentence
 
     assert said(one=[BETTER]) == "The radius is held best by a learned agent on one."
     classical = "The radius is held best by a classical controller on all 2 scenarios."
@@ -63,7 +73,7 @@ def test_the_sentence_says_which_kind_holds_the_radius_best_and_where():
 
 
 def test_the_table_has_a_row_a_scenario_with_the_best_of_each_kind():
-    results = made(one=[WORSE, BETTER, WORSE], two=[EITHER, WORSE, BETTER], three=[WORSE, EITHER, WORSE])
+    results = differing(one=[WORSE, BETTER, WORSE], two=[EITHER, WORSE, BETTER], three=[WORSE, EITHER, WORSE])
     heads, rows = verdict(results)[1:]
     assert heads[2::2] == (
         "best learned from the reward [mm]",
@@ -81,22 +91,22 @@ def test_the_table_has_a_row_a_scenario_with_the_best_of_each_kind():
 
 
 def test_a_single_crystal_does_not_count_beside_others():
-    assert [row[0] for row in verdict(made(one=[WORSE], single=[BETTER])).rows] == ["one"]
-    assert verdict(made(single=[Estimate(-1.0, None, 1)])).rows[0][-1] == "a"
+    assert [row[0] for row in verdict(differing(one=[WORSE], single=[BETTER])).rows] == ["one"]
+    assert verdict(differing(single=[Estimate(-1.0, None, 1)])).rows[0][-1] == "a"
 
 
 def test_there_is_no_verdict_on_a_few_crystals_or_of_one_kind_alone(monkeypatch):
-    nobody, case = made(one=[]), Case("one", "randomized", "")
+    nobody, case = differing(one=[]), Case("one", "randomized", "")
     alone = "No learned agent took part in this run."
     assert verdict(nobody) == (alone, (), ())
     seer = contender("a", training_seeds=(0,), privileged=True)
-    assert verdict(samples.made(case, (seer, {"rmse_mm": [0.0] * FEWEST}))) == (alone, (), ())
+    assert verdict(made(case, (seer, {"rmse_mm": [0.0] * FEWEST}))) == (alone, (), ())
     agent = contender("b", training_seeds=(0,))
-    only = samples.made(case, (agent, {"rmse_mm": [0.0] * FEWEST}))
+    only = made(case, (agent, {"rmse_mm": [0.0] * FEWEST}))
     assert verdict(only).sentence.startswith("No classical controller took part")
     monkeypatch.setattr(tables, "FEWEST", FEWEST + 1)
-    assert verdict(made(one=[BETTER])) == ("No verdict: 20 crystals, and a verdict needs at least 21.", (), ())
-    one = samples.made(case, (contender("lqg"), {"rmse_mm": [0.0]}), (agent, {"rmse_mm": [0.0]}))
+    assert verdict(differing(one=[BETTER])) == ("No verdict: 20 crystals, and a verdict needs at least 21.", (), ())
+    one = made(case, (contender("lqg"), {"rmse_mm": [0.0]}), (agent, {"rmse_mm": [0.0]}))
     assert verdict(one).sentence.startswith("No verdict: 1 crystal, ")
 
 
@@ -107,11 +117,11 @@ def test_controllers_that_lose_equally_few_crystals_are_named_together(monkeypat
         (contender(name), {"failure_rate": [lost] * FEWEST, "rmse_mm": [rmse] * FEWEST}) for name, lost, rmse in losses
     ]
     monkeypatch.setattr(task_records, "_plain", lambda column, benchmark, case, name: f"{name}'s")
-    assert crystal_verdict(samples.made(case, *figures)).sentence.startswith(
+    assert crystal_verdict(made(case, *figures)).sentence.startswith(
         "b, c and d lose the fewest crystals; of them c, which loses c's % of crown, has the least error in the crown; "
     )
     few = [(who, {name: each[:1] for name, each in values.items()}) for who, values in figures]
-    assert crystal_verdict(samples.made(case, *few)).sentence.startswith("No verdict: 1 crystal, ")
+    assert crystal_verdict(made(case, *few)).sentence.startswith("No verdict: 1 crystal, ")
 
 
 def test_an_agent_stands_with_those_that_were_told_as_much_as_the_most_told_of_its_training_seeds():
@@ -124,3 +134,63 @@ def test_an_agent_stands_with_those_that_were_told_as_much_as_the_most_told_of_i
         "learned from the reward, state told in training",
         "learned, plant known in training",
     ]
+
+
+AGENTS = {"gradient": 0.05, "ppo": 0.06, "sac": 0.2, "ppo-plain": 0.3}
+"""Shipped agents with their RMSE [mm], as on the test crystals."""
+NOMINAL = find_case("nominal")
+
+
+def sample(name, rmse, **facts):
+    return contender(name, **facts), {"rmse_mm": [rmse]}
+
+
+def names(contenders):
+    return [one.name for one in contenders]
+
+
+def everyone():
+    """The default table: classical controllers of the registry, and the shipped agents."""
+    classical = [(each, {"rmse_mm": [0.1]}) for each in CONTROLLERS if each.default]
+    return classical + [sample(*each, training_seeds=(0,)) for each in AGENTS.items()]
+
+
+def test_many_controllers_are_chosen_by_a_rule():
+    many = [sample("bound", 0.1, observation="state"), sample("paper", 9.0)]
+    many += [*(sample(f"c{i}", 1.0 + i) for i in range(6)), sample("ppo", 99.0, training_seeds=(0,))]
+    shown = names(chosen(made(NOMINAL, *many), NOMINAL, 4))
+    assert shown == ["paper", "c0", "c1", "ppo"]
+    assert names(chosen(made(NOMINAL, *many[::-1]), NOMINAL, 4)) == shown[::-1]
+    assert names(chosen(made(NOMINAL, *many), NOMINAL, 99)) == [who.name for who, _ in many]
+
+
+def test_figure_and_short_table_show_who_is_quoted_the_best_agents_and_one_s_own():
+    usual = ["paper", "paper-tuned", "lqg-at-0.02", "lqg-one-design", "gradient", "ppo"]
+    assert names(chosen(made(NOMINAL, *everyone()), NOMINAL, COLUMNS)) == usual
+    mine = made(NOMINAL, *everyone(), sample("mine", 50.0, own=True))
+    assert {"paper", "mine", "gradient"} < set(names(chosen(mine, NOMINAL, COLUMNS)))
+    lines = brief(made(NOMINAL, *everyone())).split("\n\n")[0].splitlines()
+    shown = [line.split(" | ")[0].strip("| ") for line in lines[2:]]
+    assert [name for name in shown if "*" not in name] == [*usual, "sac", "ppo-plain"]
+    assert [name for name in shown if "*" in name] == ["*classical*", "*learned from the reward*"]
+
+
+def test_no_two_controllers_look_alike():
+    assert len(COLOURS) >= NAMED
+    known = styles_of([who for who, _ in everyone()])
+    assert len({one.colour for one in known.values()}) == len(known) == len(everyone())
+
+
+@pytest.mark.filterwarnings("error")
+def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_formula():
+    parts = []
+    for name in ("nominal", "randomized"):
+        row = find_case(name)
+        run = rollout(OpenLoop(), make_config(name, horizon=600.0, **PLAIN), row.seeds(2))
+        who = ["a $\\frac$ b", *(f"c{i}" for i in range(COLUMNS))]
+        parts.append(rolled_out(row, [(contender(each, training_seeds=(1,)), run) for each in who]))
+    figures = draw_figures(joined(parts))
+    assert set(figures) == {"crystal.png", "pareto.png"}
+    assert all(image.startswith(b"\x89PNG") for image in figures.values())
+    inches = Image.open(io.BytesIO(figures["crystal.png"])).width / DPI
+    assert 830.0 / inches * 8.0 / 72.0 > 10.0, "8 point text is too small where a page shows the figure 830 pixels wide"

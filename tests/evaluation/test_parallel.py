@@ -1,5 +1,6 @@
-"""Tasks on a Dask cluster: two real workers bring the same table as one machine, and what would not work is said."""
+"""Processes side by side, on one machine or a Dask cluster, bring every result, and end with their caller."""
 
+import multiprocessing
 import os
 import re
 import signal
@@ -12,14 +13,72 @@ from types import SimpleNamespace
 
 import pytest
 
-pytest.importorskip("distributed")
 from cz_gym.evaluation import parallel, user_code
 from cz_gym.evaluation.metrics import SPEED
+from cz_gym.evaluation.parallel import in_processes
 from cz_gym.evaluation.protocol import find_case
 from cz_gym.support.errors import CzError
 from cz_gym.tools.registry import find_controller
 from cz_gym.tools.run import run
-from tests.processes import ROOT
+from tests.conftest import ROOT
+
+
+def number_and_process(task):
+    """What came with the process's number, if no Ctrl-C can come to it, nor could while it began."""
+    if sys.platform != "win32":
+        assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    return task, os.getpid()
+
+
+def fail_or_sleep(task):
+    if task == 0:
+        raise IndexError("task 0")
+    time.sleep(600.0)
+
+
+def tell_and_wait(task):
+    """Print that it has begun, and after a minute that it is still there."""
+    print("begun", flush=True)
+    time.sleep(60.0)
+    print("still there", flush=True)
+
+
+@pytest.mark.slow
+def test_processes_bring_results_and_end_alone():
+    """A process that the caller has of its own goes on."""
+    own = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600.0,))
+    own.start()
+    try:
+        found = dict(result for _, result in in_processes(number_and_process, [3, 4], processes=2))
+        assert found.keys() == {3, 4}
+        began = time.monotonic()
+        with pytest.raises(IndexError, match="task 0") as caught:
+            list(in_processes(fail_or_sleep, [1, 0, 2], processes=2))
+        assert "fail_or_sleep" in str(caught.value.__cause__), "the traceback of the other process"
+        assert time.monotonic() - began < 120.0
+        assert own.is_alive()
+    finally:
+        own.kill()
+        own.join()
+
+
+@pytest.mark.slow
+def test_a_killed_process_is_one_line():
+    with pytest.raises(ValueError, match="a process was killed"):
+        list(in_processes(os._exit, [1]))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
+def test_processes_end_with_a_killed_caller():
+    code = "from cz_gym.evaluation.parallel import in_processes; from tests.evaluation.test_parallel import *"
+    main = 'if __name__ == "__main__": list(in_processes(tell_and_wait, [0]))'
+    with subprocess.Popen([sys.executable, "-c", f"{code}\n{main}"], cwd=ROOT, stdout=subprocess.PIPE) as caller:
+        assert caller.stdout is not None
+        assert caller.stdout.readline() == b"begun\n"
+        caller.kill()
+        assert caller.stdout.read() == b"", "a process outlived its caller"
+
 
 ONCE = """
 import os, time
@@ -40,7 +99,12 @@ class Still:
 
 
 @pytest.fixture
-def workers(tmp_path):
+def dask():
+    pytest.importorskip("distributed")
+
+
+@pytest.fixture
+def workers(tmp_path, dask):
     """The address of a scheduler with two workers, each a process of its own."""
 
     def start(kind, *arguments):
@@ -104,6 +168,7 @@ def client(threads=1, sees=True, **others):
         ({"sees": False}, "worker tcp://w:1 does not see .*: name a folder that all machines share"),
     ],
 )
+@pytest.mark.usefixtures("dask")
 def test_workers_that_would_give_other_numbers_are_named(given, said, tmp_path):
     with pytest.raises(CzError, match=said):
         parallel._check_workers(client(**given), tmp_path)
@@ -111,6 +176,7 @@ def test_workers_that_would_give_other_numbers_are_named(given, said, tmp_path):
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere", "ssh://a:b:c"])
+@pytest.mark.usefixtures("dask")
 def test_an_address_without_a_scheduler_is_one_line(address, monkeypatch):
     monkeypatch.setattr(parallel, "ANSWER", 0.5)
     with pytest.raises(CzError, match=f"no Dask scheduler answers at '{address}'"):

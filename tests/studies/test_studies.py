@@ -1,0 +1,206 @@
+"""Studies on small runs: model cards, the frontier, the leaderboard, speed, stock learners."""
+
+import json
+import shutil
+import timeit
+from functools import partial
+from types import SimpleNamespace
+from typing import Any, cast
+
+import gymnasium as gym
+import pytest
+import yaml
+
+from cz_gym import agents
+from cz_gym.evaluation.protocol import CASES, TRAINING_SEEDS
+from cz_gym.tools.report.task_records import contract_hash
+from studies import cards, frontier, leaderboard, speed, stock
+
+FIGURES = {key: {"mean": 0.0, "ci95": [0.0, 0.5]} for key in (*(of.metric for of in cards.FIGURES), cards.RETURN)}
+
+
+def test_every_shipped_agent_has_a_card_with_the_benchmark_s_figures(tmp_path):
+    shipped = agents.shipped_names()
+    assert set(shipped) <= set(cards.AGENTS)
+    lost = {**FIGURES, "rmse_mm": {"mean": 1.25, "ci95": [1.0, 2.0]}, "failure_rate": {"mean": 0.25, "ci95": None}}
+    results = {
+        "hard": dict.fromkeys(cards.AGENTS, FIGURES),
+        "puller": {**dict.fromkeys(cards.AGENTS, FIGURES), "ppo": lost},
+    }
+    (tmp_path / "benchmark.json").write_text(json.dumps({"results": results}))
+    command = ["--benchmark", str(tmp_path / "benchmark.json"), "--out", str(tmp_path / "cards.md")]
+    assert cards.main([*command, "--hub", str(tmp_path / "hub")]) == 0
+    _, metadata, text = (tmp_path / "hub" / "ppo" / "README.md").read_text().split("---\n")
+    (entry,) = yaml.safe_load(metadata)["model-index"]
+    assert [result["dataset"]["name"] for result in entry["results"]] == ["Cz-v0 hard", "Cz-v0 puller"]
+    assert text.startswith("\n# `ppo`")
+    agents.OnnxPolicy.load(tmp_path / "hub" / "ppo" / "ppo-seed0.onnx")
+    sections = (tmp_path / "cards.md").read_text().split("\n## ")[1:]
+    assert [section.split("`")[1] for section in sections] == shipped
+    for section in sections:
+        fails = section.startswith("`ppo`")
+        assert ("loses crystals of `puller`." in section) == fails
+        assert ("| puller | 1.2500 [1.0000, 2.0000] |" in section) == fails
+
+
+def test_results_without_the_shipped_agents_are_refused(tmp_path, refused):
+    (tmp_path / "some.json").write_text('{"results": {"hard": {}}}')
+    command = ["--benchmark", str(tmp_path / "some.json"), "--out", str(tmp_path / "cards.md")]
+    assert "no results of gradient, ppo" in refused(cards.main, command)
+
+
+def entry(activity, rmse):
+    found = {"pull_step_rms_mm_per_min": activity, "rmse_mm": rmse, "return": -rmse}
+    return {name: {"mean": value} for name, value in found.items()}
+
+
+def test_a_benchmark_is_compared_at_equal_activity(tmp_path, capsys):
+    scenario = {name: entry(a, 0.01 * a**-0.5) for name, a in (("lqg-at-0.005", 0.005), ("lqg-quiet", 0.02))}
+    others = {"ppo": (0.01, 0.2), "calm": (0.001, 0.4), "lively": (0.03, 0.1), "wild": (0.01, 0.5)}
+    scenario |= {name: entry(*pair) for name, pair in others.items()}
+    file = tmp_path / "benchmark.json"
+    file.write_text(json.dumps({"results": {"randomized": scenario, "nominal": {"ppo": entry(0.01, 0.2)}}}))
+    assert frontier.main([str(file)]) == 0
+    told = capsys.readouterr().out
+    assert "| ppo | 0.0100 | 0.2000 | 2.000 | -0 |" in told
+    assert "| calm | 0.0010 | 0.4000 | quieter than any LQG | -0 |" in told
+    assert "| lively | 0.0300 | 0.1000 | 1.414, more active than any LQG (0.0200) | -0 |" in told
+    assert "1.00 over the 3 controllers outside the reference family, 0.82 with its members" in told
+    assert "Of 9 pairs whose ratios are more than 5% apart, the return ranks 8 as the ratio does." in told
+    assert "## nominal\n\na frontier needs two settings" in told
+
+
+def test_episodes_beside_a_benchmark_give_intervals_unless_they_are_of_another_run(tmp_path, capsys, refused):
+    values = {"lqg-at-0.02": (0.02, 0.05), "lqg-quiet": (0.01, 0.07), "agent": (0.015, 0.06)}
+    lines = ["scenario,controller,training_seed,seed,pull_step_rms_mm_per_min,rmse_mm"]
+    lines += [f"randomized,{name},,{seed},{a},{e}" for name, (a, e) in values.items() for seed in (1, 2)]
+    (tmp_path / "episodes.csv").write_text("\n".join(lines))
+    path = tmp_path / "benchmark.json"
+    path.write_text(json.dumps({"results": {"randomized": {name: entry(*pair) for name, pair in values.items()}}}))
+    assert frontier.main([str(path), "--out", str(tmp_path / "ratios.md")]) == 0
+    assert "| 1.044 [1.044, 1.044] | -0 |" in (tmp_path / "ratios.md").read_text()
+    assert "| 1.044 [1.044, 1.044] | -0 |" in capsys.readouterr().out
+    (tmp_path / "episodes.csv").write_text("\n".join([*lines[:-1], lines[-1].replace("0.06", "nan")]))
+    assert "no episodes of a benchmark, or damaged" in refused(frontier.main, [str(path)])
+    (tmp_path / "episodes.csv").write_text("\n".join(lines))
+    path.write_text(path.read_text().replace("0.06", "0.0601"))
+    assert "episodes.csv is of another run: agent on randomized" in refused(frontier.main, [str(path)])
+
+
+MEAN = {"mean": 0.0125, "ci95": None}
+
+
+@pytest.fixture
+def submissions(tmp_path, monkeypatch):
+    """A folder with one submission, the shipped PPO under another name, with a claim that is too good."""
+    monkeypatch.setattr(leaderboard, "CASES", CASES[:1])
+    monkeypatch.setattr(leaderboard, "CONTROLLERS", leaderboard.CONTROLLERS[:2])
+    folder = tmp_path / "submissions" / "mine"
+    folder.mkdir(parents=True)
+    for file in agents.MODELS.glob("ppo-seed0.*"):
+        shutil.copy(file, folder)
+    results, contract = {"randomized": {"mine": {"rmse_mm": MEAN}}}, contract_hash(CASES[:1])
+    claim = {"results": results, "provenance": {"contract": contract}}
+    (folder / "benchmark.json").write_text(json.dumps(claim))
+    return folder.parent
+
+
+def test_a_claim_stands_beside_what_fresh_crystals_show(submissions, tmp_path):
+    command = [str(submissions), "--episodes", "2", "--first-seed", "3000007", "--out", str(tmp_path)]
+    assert leaderboard.main(command) == 0
+    page = (tmp_path / "leaderboard.md").read_text()
+    (line,) = (line for line in page.splitlines() if line.startswith("| open |"))
+    _, budget, place, name, told, seeds, claimed, here, _, contract, _ = (cell.strip() for cell in line.split("|"))
+    assert (budget, place, name, told, seeds, claimed) == ("open", "1", "mine", "state, in training", "1", "0.013")
+    assert contract == "the same"
+    assert 0.02 < float(here.split()[0]) < 0.3
+    assert "seeds 3000007 to 3000008" in page
+    assert "| paper |" in page
+    found = json.loads((tmp_path / "leaderboard.json").read_text())
+    assert found["provenance"]["scenarios"]["randomized"]["first_seed"] == 3_000_007
+
+
+@pytest.mark.parametrize(
+    ("steps", "name"), [(1_048_576, "1 M"), (1_100_000, "5 M"), (5_242_880, "5 M"), (20_447_232, "20 M"), (6e7, "open")]
+)
+def test_an_agent_has_the_smallest_budget_that_its_longest_training_keeps(steps, name):
+    """The recipe ppo, asked for 1, 5 and 20 million steps, ends with its update: after 2,048 x 64 x 4 steps each."""
+    trained = [SimpleNamespace(contract=SimpleNamespace(training_steps=each)) for each in (9, steps)]
+    assert leaderboard.budget(cast("Any", SimpleNamespace(trained=trained))) == name
+
+
+def test_fresh_seeds_are_nobody_else_s():
+    taken = {seed for row in CASES for seed in row.seeds(500)} | {TRAINING_SEEDS.stop}
+    assert max(taken) < leaderboard.FRESH.start
+
+
+def test_what_is_no_submission_is_named(submissions, tmp_path, refused):
+    assert "no such" in refused(leaderboard.main, [str(tmp_path / "nowhere")]).lower()
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "no submissions" in refused(leaderboard.main, [str(empty)])
+    for broken in ("", "[]", '{"results": {"randomized": {"mine": {"rmse_mm": {"mean": "x"}}}}}', '{"results": 1}'):
+        (submissions / "mine" / "benchmark.json").write_text(broken)
+        assert "is no benchmark.json" in refused(leaderboard.main, [str(submissions), "--out", str(tmp_path)])
+    (submissions / "mine" / "benchmark.json").write_text('{"results": {"randomized": {}}}')
+    assert "no results of 'mine'" in refused(leaderboard.main, [str(submissions), "--out", str(tmp_path)])
+
+
+QUICK = {
+    "Cz-v0 scalar": partial(gym.make, "Cz-v0"),
+    "Pendulum-v1 scalar": partial(gym.make, "Pendulum-v1"),
+    "Cz-v0 batch, measured, 2 threads": partial(speed.our_batch, 8, 2),
+    "bare compiled plant and ring, 1 thread": partial(speed.bare_plant, 8, 1),
+}
+
+
+@pytest.fixture
+def one_call(monkeypatch):
+    monkeypatch.setattr(timeit.Timer, "autorange", lambda timer: (1, 0.0))
+
+
+@pytest.mark.usefixtures("one_call")
+def test_the_speed_command_writes_json_and_prints_a_table(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(speed, "cases", lambda: {**QUICK, "peer": partial(__import__, "no_such_package")})
+    file = tmp_path / "new" / "speed.json"
+    assert speed.main(["--quick", "--json", str(file)]) == 0
+    found = json.loads(file.read_text())
+    assert list(found["ratios"]) == [*speed.RATIOS]
+    assert found["ratios"]["scalar_vs_pendulum"] > 0
+    assert found["ratios"]["vector1024_vs_envpool_pendulum"] is None
+    assert [(row["name"], row["steps_per_s"] > 0) for row in found["rows"]] == [(name, True) for name in QUICK]
+    assert found["skipped"] == {"peer": "ModuleNotFoundError: No module named 'no_such_package'"}
+    said = capsys.readouterr().out
+    assert all(name in said for name in (*found["ratios"], "skipped: ModuleNotFoundError", "Pendulum-v1 scalar"))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("one_call")
+def test_every_row_of_ours_can_be_made_and_steps():
+    wanted = {name: make for name, make in speed.cases(8, 2).items() if not name.startswith("EnvPool")}
+    result = speed.measure(wanted, 1)
+    assert result["skipped"] == {}
+    assert len(result["rows"]) == len(wanted)
+
+
+def test_runs_are_kept_and_the_table_has_each_seed(tmp_path, monkeypatch, capsys):
+    trained = []
+
+    def train(name, seed):
+        trained.append((name, seed))
+        return [(stock.LEARNERS[name].words, seed, steps, 0.1 + seed, 0.005) for steps in (1_000_000, 2_000_000)]
+
+    monkeypatch.setattr(stock, "train", train)
+    name = next(iter(stock.LEARNERS))
+    for seeds in ("1", "2"):
+        assert stock.main([name, "--seeds", seeds, "--out", str(tmp_path)]) == 0
+    assert trained == [(name, 0), (name, 1)]
+    assert (
+        f"| {stock.LEARNERS[name].words} | 2 M | 2 | 0.100 / 1.100 | 0.5 / 0.5 |" in (tmp_path / "table.md").read_text()
+    )
+    assert capsys.readouterr().out.count("# Stock learners") == 2
+    assert stock.main(["sac", "--out", str(tmp_path)]) == 2
+    assert "unknown learner 'sac'" in capsys.readouterr().err
+    (tmp_path / "runs.csv").write_text("learner\n\nppo")
+    assert stock.main([name, "--out", str(tmp_path)]) == 2
+    assert "no runs of this study, or damaged" in capsys.readouterr().err
