@@ -9,6 +9,8 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,8 +22,9 @@ from cz_gym.puller.file import DEFAULT
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import check_writable, name_file_in_errors, write_files
 
+from .margins import MarginLimits, Openings, worst_margins
 from .policy import Floats
-from .tuned import Measure, Objective, value_at, with_values
+from .tuned import Limit, Measure, Objective, value_at, with_values
 
 FIRST_STEP = 0.5
 """COBYLA's first step, in natural logarithms of the parameters."""
@@ -60,10 +63,14 @@ class Search:
         episodes: int,
         measure: Measure | None = None,
         quick: bool = False,
+        margins: MarginLimits | None = None,
     ) -> None:
         """At most ``trials`` candidates, each on ``episodes`` training episodes; a ``quick`` search ends at QUICK_STEP,
-        and only its finalists have to survive other scenarios.
+        and only its finalists have to survive other scenarios. Within ``margins`` no crystal may be lost either.
         """
+        if margins:
+            objective = replace(objective, limits=(*objective.limits, *robustness(margins, config)))
+        self.margins = margins
         self.controller, self.objective, self.config, self.quick = controller, objective, config, quick
         self.measure = measure or objective.measure
         self.budget, self.trials = {"trials": trials, "episodes": episodes}, list[Trial]()
@@ -151,6 +158,9 @@ class Search:
             {"score": trial.score, "values": dict(zip(self._paths, trial.values, strict=True)), **trial.facts}
             for trial in judged
         ]
+        for entry, trial in zip(entries if self.margins else (), judged, strict=False):
+            found = worst_margins(self.settings(trial.values).for_config(self.config), self.config)
+            entry["margins"] = written(found)
         self._write({"chosen": entries[0], "finalists": entries})
         return judged[0]
 
@@ -162,7 +172,7 @@ class Search:
             parameters, puller = file["parameters"], file.get("puller", DEFAULT.label)
             crystals = file["scenario_hash"], file.get("control_interval_s", self.config.puller.control_interval)
             self.trials = [Trial(tuple(values), score, facts) for values, score, facts in file["history"]]
-            episodes = file["budget"]["episodes"]
+            episodes, margins = file["budget"]["episodes"], file.get("margins")
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise CzError(f"{path} is no history of this search: {error!r}") from None
         if parameters != self._paths:
@@ -171,6 +181,9 @@ class Search:
             raise CzError(f"{path}: found for puller {puller}: remove it to begin anew")
         if crystals != (self.config.scenario.hash, self.config.control_interval):
             raise CzError(f"{path} was begun on other crystals or at another control interval: write another file")
+        if margins != (self.margins and list(self.margins)):
+            was, now = (",".join(f"{each:g}" for each in limits or ()) or "off" for limits in (margins, self.margins))
+            raise CzError(f"{path} was begun with --margins {was}, not {now}: write another file")
         if episodes != self.budget["episodes"]:
             raise CzError(f"{path} was begun with {episodes} episodes; ask for as many, or write another file")
 
@@ -187,6 +200,29 @@ class Search:
             about["puller"] = self.config.puller.label
         if self.config.control_interval != self.config.puller.control_interval:
             about["control_interval_s"] = self.config.control_interval
+        if self.margins:
+            about["margins"] = list(self.margins)
         lines = ",\n  ".join(map(json.dumps, self.trials))
         head = json.dumps({**about, **choice, "parameters": self._paths}, indent=1).removesuffix("\n}")
         write_files({self.path: f'{head},\n "history": [\n  {lines}\n ]\n}}\n'.encode()})
+
+
+def robustness(margins: MarginLimits, config: Config) -> tuple[Limit, ...]:
+    """Limits of a search: the margins at every opening on the worse of Models I and II, and no crystal lost."""
+
+    @lru_cache(maxsize=8)
+    def slacks(policy: Any) -> tuple[float, ...]:
+        return margins.slacks(worst_margins(policy, config))
+
+    def slack(which: int) -> Limit:
+        return lambda scores, policy: slacks(policy)[which]
+
+    return (*map(slack, range(len(margins))), lambda scores, policy: -scores.failure_rate)
+
+
+def written(openings: Openings) -> dict[str, dict[str, float | None]]:
+    """Margins for a file, by opening; None for an infinite one."""
+    return {
+        place: {name: float(f"{value:.4g}") if math.isfinite(value) else None for name, value in each._asdict().items()}
+        for place, each in openings._asdict().items()
+    }

@@ -27,6 +27,7 @@ from cz_gym.support.errors import CzError
 
 from .lqg import STEP_TIME, LQGDesign
 from .lqg_filter import ring_of
+from .margins import MarginLimits
 
 TUNED = (RANDOMIZED, HARD, SENSOR_FAULT, PULLER)
 """Scenarios that controllers are tuned on, the least demanding first."""
@@ -258,6 +259,8 @@ class TunedController:
     """Objectives of its searches, by scenario, with the keys ``ANY`` and ``OWN_PULLER`` too."""
     scale: Callable[[Any, Config], Any] | None
     """Puts settings in proportion to the puller of an environment; None keeps them."""
+    margins: MarginLimits | None = None
+    """Margins that its searches on scenarios keep; None for none."""
     crystals: Any = RANDOMIZED
     """Crystals of its search on ``randomized``."""
     crystals_on_puller: Any = field(default_factory=lambda: {"randomized": 0.5, "hot-zone": 0.5}, hash=False)

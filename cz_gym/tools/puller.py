@@ -7,12 +7,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from cz_gym.baselines.margins import EXPLAINED, HEADS, shown
+from cz_gym.baselines.tuned_controllers import LQGS, PIDS
 from cz_gym.body.process import STATES, linearise, radius_model
+from cz_gym.config import make_config
+from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.physics.parameters import MACHINE, Parameters
 from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, make_puller
 from cz_gym.puller.file import PullerFile, defaults_of, doubts, find_puller, value_of
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.units import CELSIUS, HOUR, KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.tools.report.tables import markdown
 
 
 def implied(puller: PullerFile) -> dict[str, str]:
@@ -58,6 +63,13 @@ def _stated(puller: PullerFile, *symbols: str) -> str:
     return text
 
 
+def margins(puller: PullerFile) -> str:
+    """Margins of the controllers that are searched for a puller, as they are designed for it now, as a table."""
+    config = make_config(RANDOMIZED, observation="measured", action="direct", puller=puller)
+    rows = [(each.name, *row) for each in (*PIDS, *LQGS) if each.near for row in shown(each.make(config), config)]
+    return f"{markdown(('controller', *HEADS), rows)}\n\n{EXPLAINED}"
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser("cz-gym puller", "Print what a puller file implies.")
@@ -75,5 +87,6 @@ def _main(given: argparse.Namespace) -> None:
     print(f"puller {puller.label}")
     for heading, text in lines.items():
         print(f"{heading:<15} {text or 'nothing'}")
+    print(f"\n{margins(puller)}")
     for doubt in doubts(puller):
         print(doubt, file=sys.stderr)

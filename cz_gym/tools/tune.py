@@ -11,6 +11,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
+from cz_gym.baselines.margins import MarginLimits, margin_limits
 from cz_gym.baselines.search import Search, Trial
 from cz_gym.baselines.tuned import OWN_PULLER, TunedController, file_name, folder_of
 from cz_gym.baselines.tuned_controllers import CRYSTALS, LQGS, PIDS
@@ -23,8 +24,8 @@ from cz_gym.support.command_line import OneLineParser, between, relative_path
 from cz_gym.support.errors import CzError, unknown_name_message
 
 TUNABLE: dict[str, TunedController] = {each.name: each for each in (*PIDS, *LQGS, *CRYSTALS)}
-Task = tuple[TunedController, PullerFile, int, int, Path]
-"""A search for a puller: controller, puller, candidates, episodes and folder."""
+Task = tuple[TunedController, PullerFile, int, int, MarginLimits | None, Path]
+"""A search for a puller: controller, puller, candidates, episodes, least margins and folder."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -45,6 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         default=BODY.name,
         help=f"with --puller: whose controllers to search (default: {BODY.name})",
     )
+    about = "gain [-], phase [deg] and peak of the sensitivity [-] that a choice keeps at pull, heater and ring, or off"
+    add("--margins", type=str, help=f"{about} (with --puller 2,30,2, on a scenario the controller's own)")
     add("--out", type=Path, help="folder of histories and choices (runs/tuning; with --puller beside its file)")
     return parser.run(_tune, arguments, "benchmark", "the same command continues from the candidates in its history")
 
@@ -67,13 +70,26 @@ def _tune(given: argparse.Namespace) -> None:
     if tuned.process != BODY and scenario != RANDOMIZED:
         raise CzError(f"{tuned.name} has one search: leave --scenario {name} out")
     config = tuned.search_config(scenario, given.control_interval)
-    search = Search(tuned.name, tuned.objective(scenario), config, given.trials or 100, given.episodes or 100)
+    margins = asked_margins(given, tuned, tuned.margins)
+    budget = given.trials or 100, given.episodes or 100
+    search = Search(tuned.name, tuned.objective(scenario), config, *budget, margins=margins)
     path = (given.out or Path("runs/tuning")) / file_name(tuned.name, name)
     chosen = search.tune(path)
     print(f"{tuned.name} on {name}: score {chosen.score:.4f} on validation crystals")
     for parameter, value in zip(search.objective.parameters, chosen.values, strict=True):
         print(f"  {parameter.path} = {value:.6g}")
     print(f"wrote {relative_path(path)}")
+
+
+def asked_margins(
+    given: argparse.Namespace, tuned: TunedController, unless: MarginLimits | None
+) -> MarginLimits | None:
+    """The margins of a search: those of the command line, or others; a controller of whole crystals has none."""
+    if tuned.process != BODY:
+        if given.margins not in (None, "off"):
+            raise CzError(f"{tuned.name} has no linear loop along a whole crystal: leave --margins out")
+        return None
+    return unless if given.margins is None else margin_limits(given.margins)
 
 
 def tunable(given: argparse.Namespace) -> dict[str, TunedController]:
@@ -92,7 +108,14 @@ def tasks_for(given: argparse.Namespace, puller: PullerFile) -> list[Task]:
     searched = [known[given.controller]] if given.controller else alike
     folder = (given.out or folder_of(puller)).absolute()
     return [
-        (each, puller, given.trials or each.candidates * len(each.near), given.episodes or each.episodes, folder)
+        (
+            each,
+            puller,
+            given.trials or each.candidates * len(each.near),
+            given.episodes or each.episodes,
+            asked_margins(given, each, MarginLimits()),
+            folder,
+        )
         for each in searched
     ]
 
@@ -120,9 +143,9 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
 
 def search_for(task: Task) -> Trial:
     """One search for a puller."""
-    tuned, puller, trials, episodes, folder = task
+    tuned, puller, trials, episodes, margins, folder = task
     config = tuned.search_config(RANDOMIZED, puller=puller)
-    search = Search(tuned.name, tuned.objective_on(config), config, trials, episodes, quick=True)
+    search = Search(tuned.name, tuned.objective_on(config), config, trials, episodes, quick=True, margins=margins)
     return search.tune(folder / f"{tuned.name}.json")
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from cz_gym.baselines.lqg import LQGDesign
+from cz_gym.baselines.margins import MarginLimits, worst_margins
 from cz_gym.baselines.pid import FilteredPID
 from cz_gym.baselines.search import Search
 from cz_gym.baselines.tuned import (
@@ -168,6 +169,44 @@ def test_a_search_is_not_continued_on_other_crystals_or_at_another_interval(tmp_
     assert path.read_bytes() == tried
 
 
+# Margins
+
+
+def within(margins, trials, losing=False):
+    """A search for the least filter time, which has the least margins, on episodes that are lost or not."""
+
+    def figures(policy, config, seeds):
+        return SCORES._replace(rmse_mm=policy.T_f / 1000.0, pull_step=0.0, failure_rate=float(losing))
+
+    parameters = (Parameter("T_f", 2.0, 400.0), Parameter("pid.K_p", 1e-3, 1e-2))
+    start = replace(PIDS[1].settings(RANDOMIZED), T_f=20.0)
+    objective = Objective(price, (), 5.0, 2.0, start=start, parameters=parameters)
+    return Search("within", objective, CONFIG, trials, 5, figures, margins=margins)
+
+
+def test_a_search_within_margins_ends_within_them_and_says_so(tmp_path):
+    path, limits = tmp_path / "within.json", MarginLimits(1.8, 22.5, 2.6)
+    search = within(limits, 40)
+    chosen = search.tune(path)
+    found = worst_margins(search.settings(chosen.values), CONFIG)
+    assert min(limits.slacks(found)) > -2e-3
+    assert min(limits.slacks(worst_margins(search.settings(search.first), CONFIG))) < -0.05
+    written = json.loads(path.read_text())
+    assert written["margins"] == list(limits)
+    assert written["chosen"]["margins"]["ring"]["phase"] == pytest.approx(found.ring.phase, rel=1e-3)
+    for other, was in ((MarginLimits(), "1.8,22.5,2.6, not 2,30,2"), (None, "1.8,22.5,2.6, not off")):
+        with pytest.raises(CzError, match=f"begun with --margins {was}"):
+            within(other, 3).tune(path)
+
+
+def test_within_margins_a_lost_crystal_is_a_missed_limit():
+    wide = MarginLimits(1.0, 0.1, 1e3)
+    searches = within(None, 1), within(wide, 1), within(wide, 1, losing=True)
+    scores = [search.add(search.first).score for search in searches]
+    assert scores[0] == scores[1]
+    assert scores[2] == pytest.approx(scores[0] + 5.0 + 2.0)
+
+
 # PIDs
 
 
@@ -300,6 +339,8 @@ def test_the_command_writes_what_the_search_chose(name, said, trials, scenario, 
         (["--controller", "nobody"], "unknown controller to tune 'nobody'"),
         (["--controller", "pid-conventional", "--scenario", "moon"], "moon"),
         (["--controller", "lqg-along", "--scenario", "hard"], "lqg-along has one search: leave --scenario hard out"),
+        (["--controller", "lqg-along", "--margins", "2,30,2"], "lqg-along has no linear loop along a whole crystal"),
+        (["--controller", "lqg", "--margins", "two"], "--margins two: write GAIN,PHASE,PEAK, such as 2,30,2, or off"),
         (["--controller", "lqg", "--scenario", "hard"], "lqg has no goal on 'hard', but on randomized"),
     ],
 )

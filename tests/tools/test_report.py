@@ -10,11 +10,10 @@ from bs4 import BeautifulSoup
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cz_gym.baselines.analysis import linear_form, loop_margins
+from cz_gym.baselines.margins import worst_margins
 from cz_gym.evaluation.metrics import OUTSIDE
 from cz_gym.evaluation.protocol import find_case
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.physics.plant import make_puller
 from cz_gym.puller.file import find_puller
 from cz_gym.tools import benchmark
 from cz_gym.tools.registry import find_controller
@@ -238,14 +237,29 @@ def test_the_first_line_recommends_the_controller_that_loses_least_and_scraps_le
         assert "counts 13.7" in text, "the largest error on this puller, not the default one's 8 mm"
 
 
-def test_margins_are_those_of_the_worse_model_and_a_dash_where_there_is_no_loop(result):
-    rows = {name: cells for name, *cells in grower.margins(result)}
-    assert rows["open-loop"] == ["-"] * 4
+def test_margins_stand_at_three_openings_and_a_dash_where_there_is_no_loop(result):
+    rows = grower.margins(result)
+    assert [row[1:] for row in rows if row[0] == "open-loop"] == [("-",) * 6]
     config = ROW.config()
-    form = linear_form(find_controller("paper-tuned").make(config), config.sole_scenario.sensor)
-    both = [loop_margins(form.controller, make_puller(config.parameters, mix), form.dt) for mix in (1.0, 0.0)]
-    wanted = min(one.gain_up for one in both), max(one.gain_down for one in both), min(one.phase_deg for one in both)
-    assert rows["paper-tuned"][:3] == [f"{value:.3g}" for value in wanted]
+    worst = worst_margins(find_controller("paper-tuned").make(config), config)
+    found = [row[1:] for row in rows if row[0] == "paper-tuned"]
+    assert [place for place, *_ in found] == ["pull", "heater", "ring"]
+    for (_, up, _, phase, *_), margin in zip(found, worst, strict=True):
+        assert up.startswith(f"{margin.gain_up:.3g} (")
+        assert phase.startswith(f"{margin.phase:.3g} (")
+
+
+def test_a_warning_names_a_controller_whose_drives_stand_at_limits_or_swing(result, monkeypatch):
+    monkeypatch.setattr(grower, "AT_LIMITS", 2.0)
+    monkeypatch.setattr(grower, "SWINGS", 1e9)
+    assert not grower.warnings(result)
+    monkeypatch.setattr(grower, "AT_LIMITS", -1.0)
+    monkeypatch.setattr(grower, "SWINGS", -1.0)
+    said = grower.warnings(result)
+    share = 100 * result.mean(ROW, "paper-tuned", "time_at_limits")
+    assert f"Warning: a drive of paper-tuned stands at a limit for {share:.0f} % of the time on randomized." in said
+    assert len(said) == 2 * len([each for each in result.contenders if not each.bound])
+    assert all(line in markdown(result, "", ()) for line in said)
 
 
 @pytest.mark.parametrize("options", [["--tolerance", "1"], ["--puller", "germanium", "--tolerance", "-1"]])

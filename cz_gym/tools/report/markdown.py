@@ -2,17 +2,18 @@
 
 import shlex
 from collections.abc import Iterable, Sequence
-from typing import Any
+from contextlib import suppress
+from functools import lru_cache
 
 import numpy as np
 
-from cz_gym.baselines.analysis import linear_form, loop_margins
+from cz_gym.baselines.margins import EXPLAINED as BEARS
+from cz_gym.baselines.margins import HEADS, shown
 from cz_gym.evaluation.metrics import OUTSIDE
 from cz_gym.evaluation.protocol import BOUND, REFERENCE, Case, Contender
-from cz_gym.physics.plant import make_puller
 from cz_gym.puller.file import DEFAULT
 from cz_gym.support.errors import CzError
-from cz_gym.support.units import MM, PERCENT
+from cz_gym.support.units import KILO, MM, PERCENT
 from cz_gym.tools.episodes import Benchmark
 from cz_gym.tools.report.task_records import BODY_DRIVES, contract_hash, task_of
 
@@ -57,11 +58,9 @@ EXPLAINED = (
     "Scrap is the share of the time in which the diameter is outside the tolerance band (--tolerance); a lost crystal "
     "is scrap to the end. v/G stays within 3 % where the 30 min mean of the pull speed does."
 )
-MARGINS_EXPLAINED = (
-    "Margins of the sampled loop, opened at the ring, near rest, on the worse of the plant's Models I and II; "
-    "- for a controller without a linear form."
-)
-MARGINS = ("controller", "gain may grow by", "gain may fall to", "phase margin [deg]", "delay margin [s]")
+AT_LIMITS, SWINGS = 0.2, 30.0
+"""Share of time at its drives' limits [-], and heater step RMS [W], beyond which a controller gets a warning."""
+MARGINS = ("controller", *HEADS)
 """Heads of :func:`margins`."""
 
 
@@ -111,40 +110,45 @@ def recommendation(benchmark: Benchmark) -> str:
         if lost <= FIT
         else f"No controller is fit for {machine}: {best.name} loses the fewest crystals, {lost / PERCENT:.2g} %"
     )
-    up, down, phase, delay = _margins(best, cases[0])
-    loop = (
-        f" Its loop bears {down} to {up} times its gain, {phase} degrees and a delay of {delay} s."
-        if delay != NOTHING
-        else ""
-    )
+    place, up, down, phase, delay, _ = _margins(best, cases[0])[-1]
+    loop = f" Its loop, opened at the {place}, bears {down} to {up} times its gain, {phase} degrees and {delay} s more."
     return (
         f"{fate} of {crystals(number)} on {' and '.join(case.name for case in cases)}. The diameter is "
         f"outside {band(cases[0])} for {share / PERCENT:.2g} % of the time (scrap), and v/G is within 3 % for "
-        f"{steady / PERCENT:.3g} %.{loop}"
+        f"{steady / PERCENT:.3g} %.{loop if delay not in ('', NOTHING) else ''}"
     )
 
 
+def warnings(benchmark: Benchmark) -> list[str]:
+    """Return a sentence on each controller whose drives stand at limits or swing, with the scenario where most."""
+    sentences = []
+    for each in (each for each in benchmark.contenders if not each.bound):
+        limits, steps = (
+            max((benchmark.mean(case, each.name, metric), case.name) for case in benchmark.cases)
+            for metric in ("time_at_limits", HEATER_STEP.metric)
+        )
+        if limits[0] > AT_LIMITS:
+            share = f"{limits[0] / PERCENT:.0f} % of the time on {limits[1]}"
+            sentences.append(f"Warning: a drive of {each.name} stands at a limit for {share}.")
+        if steps[0] * KILO > SWINGS:
+            power = f"{steps[0] * KILO:.0f} W (RMS) a sample on {steps[1]}"
+            sentences.append(f"Warning: {each.name} moves the heater by {power}.")
+    return sentences
+
+
 def margins(benchmark: Benchmark) -> list[tuple[str, ...]]:
-    """Return a row a controller: margins of its sampled loop, opened at the ring, on the worse of Models I and II."""
-    return [(each.name, *_margins(each, benchmark.cases[0])) for each in benchmark.contenders]
+    """Return rows for each controller: margins of its sampled loop, opened at pull, heater and ring."""
+    return [(each.name, *row) for each in benchmark.contenders for row in _margins(each, benchmark.cases[0])]
 
 
-def _margins(contender: Contender, case: Case) -> tuple[str, ...]:
+@lru_cache(maxsize=64)
+def _margins(contender: Contender, case: Case) -> list[tuple[str, ...]]:
+    """Rows of a contender's margins, a row of dashes for one without a linear form."""
     config = case.config(contender.observation, contender.action)
-    absent = (NOTHING,) * (len(MARGINS) - 1)
-    if contender.learned:
-        return absent
-    try:
-        form: Any = linear_form(contender.make(config), config.sole_scenario.sensor)
-    except (CzError, AttributeError):  # it has no linear form, or is no feedback
-        return absent
-    pullers = [make_puller(config.parameters, weight, config.meniscus) for weight in (1.0, 0.0)]
-    loops = [loop_margins(form.controller, puller, form.dt) for puller in pullers]
-    if any(np.isnan(loop.sensitivity) for loop in loops):
-        return ("unstable", *absent[1:])
-    worst = (np.nanmin, "gain_up"), (np.nanmax, "gain_down"), (np.nanmin, "phase_deg"), (np.nanmin, "delay")
-    values = ((pick, [getattr(loop, name) for loop in loops]) for pick, name in worst)
-    return tuple("no limit" if np.isnan(both).all() else f"{pick(both):.3g}" for pick, both in values)
+    if not contender.learned:
+        with suppress(CzError, AttributeError):  # it has no linear form, or is no feedback
+            return shown(contender.make(config), config)
+    return [(NOTHING,) * len(HEADS)]
 
 
 # The report of any benchmark, which begins with the verdict.
@@ -204,7 +208,7 @@ def _for_a_grower(benchmark: Benchmark) -> list[str]:
     for case in benchmark.cases:
         parts += [f"**{case.name}**: {case.meaning}.", table(*outcome(benchmark, case))]
     agents = any(each.learned for each in benchmark.contenders)
-    parts += [EXPLAINED, table(MARGINS, margins(benchmark)), MARGINS_EXPLAINED]
+    parts += [EXPLAINED, *warnings(benchmark), table(MARGINS, margins(benchmark)), BEARS]
     return [*parts, *(_verdict(benchmark) if agents else [])]
 
 

@@ -235,10 +235,10 @@ def _for_a_grower(benchmark: Benchmark) -> dict[str, str]:
     return {
         "verdict": escape(markdown.recommendation(benchmark)),
         "best": f"<h2>{escape(markdown.title(benchmark.cases[0]))}</h2>{''.join(tables_of)}",
-        "best_note": escape(markdown.EXPLAINED),
+        "best_note": escape(" ".join((markdown.EXPLAINED, *markdown.warnings(benchmark)))),
         "question": "What the loops bear",
         "scenarios": _table(markdown.MARGINS, markdown.margins(benchmark)),
-        "answer_note": escape(markdown.MARGINS_EXPLAINED),
+        "answer_note": escape(markdown.BEARS),
     }
 
 
