@@ -8,6 +8,7 @@
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from inspect import Signature, signature
 from typing import Any, Self
 
 import gymnasium as gym
@@ -40,6 +41,19 @@ class EnvState:
 
     slot: SlotState
     random: dict[str, Any]
+
+
+def shows_settings(cls: Any) -> Any:
+    """Give a class the signature of its constructor with what ``*settings`` and ``**settings`` stand for."""
+    _, *own = signature(cls.__init__).parameters.values()
+    positions = any(each.kind is each.VAR_POSITIONAL for each in own)
+    own = [each for each in own if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)]
+    left_out = {"process", *(each.name for each in own)} if not positions else {each.name for each in own}
+    settings = signature(make_config if positions else cls.__base__).parameters.values()
+    settings = [each for each in settings if each.name not in left_out]
+    settings = settings if positions else [each.replace(kind=each.KEYWORD_ONLY) for each in settings]
+    cls.__signature__ = Signature(sorted([*own, *settings], key=lambda each: each.kind))
+    return cls
 
 
 class EnvBase:
@@ -115,6 +129,7 @@ class EnvBase:
             self._view.begin(self._out.info[:, 0], self._batch.memory.slots[0], self._batch.scenarios[0])
 
 
+@shows_settings
 class CzEnv(EnvBase, gym.Env[Array, Array]):
     """Czochralski growth of a silicon ingot: hold the true radius, seeing only the camera's bright ring.
 
@@ -292,6 +307,7 @@ class Info(dict[str, Any]):
         return type(self)(self)
 
 
+@shows_settings
 class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
     """Many pullers at once in one compiled loop; slot i with seed s equals :class:`CzEnv` with seed s bit for bit.
 
@@ -524,6 +540,7 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         return infos
 
 
+@shows_settings
 class CzCrystalEnv(CzEnv):
     """A whole Czochralski crystal: crown, body and tail along a recipe, seeing only the camera's bright ring.
 
@@ -558,6 +575,7 @@ class CzCrystalEnv(CzEnv):
         super().__init__(process=CRYSTAL, stage=stage, **settings)
 
 
+@shows_settings
 class CzCrystalVectorEnv(CzVectorEnv):
     """Many whole crystals at once; arguments of :class:`CzCrystalEnv` and :class:`cz_gym.CzVectorEnv`."""
 
