@@ -14,7 +14,7 @@ from cz_gym.config import make_config
 from cz_gym.crystal import recipe
 from cz_gym.crystal.process import CRYSTAL, nominal_recipe
 from cz_gym.crystal.recipe import FAILURE_MODES, relative_margin
-from cz_gym.evaluation.metrics import KWH, Metrics, crystal_metrics, metrics
+from cz_gym.evaluation.metrics import Metrics, crystal_metrics, metrics
 from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.evaluation.rollout import Rollout, rollout
 from cz_gym.physics.meniscus import HURLE
@@ -188,7 +188,7 @@ def test_energy_and_time_are_those_of_the_recipe(stage):
     t, M_s = ([recipe.look_up(table, *recipe.place(L, p), at) for L in lengths] for at in (recipe._t, recipe._M_s))
     times = np.linspace(*t, 20_000)
     power = np.interp(times, table[:, recipe._t], table[:, recipe._Q_H])
-    energy = np.trapezoid(power, times) / KWH
+    energy = np.trapezoid(power, times) / 3.6e6  # joule in a kilowatt hour
     assert m.completed[0] == 1.0
     assert m.hours[0] == pytest.approx((t[1] - t[0]) / 3600.0, rel=2e-3)
     assert m.kwh_per_kg[0] == pytest.approx(energy / (M_s[1] - M_s[0]), rel=2e-3)
