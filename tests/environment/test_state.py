@@ -27,10 +27,7 @@ def run(env, steps, first=0):
 
 @pytest.mark.parametrize(
     ("scenario", "observation"),
-    [
-        *product(("all", "sensor-fault", "puller"), ("measured", "history", "state")),
-        ("sensor-fault", "camera"),
-    ],
+    [*product(("all", "sensor-fault", "puller"), ("measured", "history", "state")), ("sensor-fault", "camera")],
 )
 def test_a_saved_state_continues_bit_for_bit(scenario, observation):
     """A state is a value; a reset from it shows its last sample."""

@@ -118,38 +118,6 @@ WITHOUT_TUPLE = SimpleNamespace(predict=lambda observation, **rest: np.zeros((le
 RATE = SimpleNamespace(predict=OF_ONE.predict, made_for=make_config(action="rate", observation="measured").made_for)
 
 
-@pytest.mark.parametrize(
-    ("policy", "config", "message"),
-    [
-        (CompensatedPID(control_interval=2.0), SHORT, "made for .*control_interval=2,.* has .*control_interval=5,"),
-        (OF_ONE, SHORT, r"actions of shape \(1, 2\) for 1 observations, not \(2,\)"),
-        (WITHOUT_STATE, SHORT, r"unexpected keyword argument 'state'; it must be predict\(observation, state=None"),
-        (CompensatedPID, SHORT, "is no policy: an object with predict"),
-        (lambda observation: observation, SHORT, "is no policy: an object with predict"),
-        (WITHOUT_TUPLE, SHORT, r"predict must return a tuple \(action, state\), not ndarray"),
-        (
-            CompensatedPID(),
-            make_config(action="smooth", observation="measured"),
-            r"made for action='direct'.* has action",
-        ),
-        (RATE, SHORT, r"made for action='rate'.* has action='direct'"),
-        ("paper", SHORT, r"as make_controller\('paper', config\) makes one"),
-    ],
-)
-def test_a_policy_that_does_not_fit_is_refused(policy, config, message):
-    with pytest.raises(ValueError, match=message):
-        rollout(policy, config, [1])
-
-
-WITH_SEED = partial(rollout, OpenLoop(), seeds=[1])
-
-
-@pytest.mark.parametrize("make", [CzEnv.from_config, partial(make_controller, "lqg"), partial(load, "ppo"), WITH_SEED])
-def test_a_scenario_name_in_place_of_a_config_is_refused(make):
-    with pytest.raises(ValueError, match=r"needs a Config, not 'hard': cz_gym.config.make_config\('hard'\) makes one"):
-        make("hard")
-
-
 def test_after_import_cz_gym_everything_is_there():
     assert cz_gym.__getattr__("agents") is import_module("cz_gym.agents")
     with pytest.raises(AttributeError, match="no attribute 'agent'"):
@@ -170,12 +138,6 @@ def test_an_agent_of_another_plant_is_refused_unless_that_is_said():
 def test_seeds_may_be_any_sequence_of_whole_numbers(seeds):
     assert check_seeds(seeds) == (3, 4)
     assert rollout(OpenLoop(), replace(SHORT, horizon=10.0), seeds).seeds == (3, 4)
-
-
-@pytest.mark.parametrize("seeds", [[], 3, 5.0, "12", [1.0], [[1]], [-1], {1}, np.array([True])])
-def test_other_seeds_are_refused(seeds):
-    with pytest.raises(CzError, match="seeds must be a sequence of at least one whole number from 0 on"):
-        rollout(OpenLoop(), SHORT, seeds)
 
 
 def test_a_rollout_can_be_looked_at(tmp_path):
@@ -254,10 +216,43 @@ def test_a_failed_episode_stays_failed():
     np.testing.assert_array_equal(found.instead.alive, found.actual.alive)
 
 
-@pytest.mark.parametrize("arguments", [{"seeds": []}, {"at": -1.0}, {"at": 601.0}, {"at": float("nan")}])
-def test_bad_arguments_are_refused(arguments):
-    with pytest.raises(ValueError, match=r"at least one whole number|must lie in the episode"):
-        replay(Playback([[0, 0]]), Playback([[0, 0]]), **{"config": CONFIG, "seeds": SEEDS, **arguments})
-    for log in ([], [1.0, 2.0], np.zeros((3, 3)), np.zeros((0, 2))):
-        with pytest.raises(ValueError, match="logged actions must be of shape"):
-            Playback(log)
+NOTHING = Playback([[0, 0]])
+POLICIES = [
+    (CompensatedPID(control_interval=2.0), SHORT, "made for .*control_interval=2,.* has .*control_interval=5,"),
+    (OF_ONE, SHORT, r"actions of shape \(1, 2\) for 1 observations, not \(2,\)"),
+    (WITHOUT_STATE, SHORT, r"unexpected keyword argument 'state'; it must be predict\(observation, state=None"),
+    (CompensatedPID, SHORT, "is no policy: an object with predict"),
+    (lambda observation: observation, SHORT, "is no policy: an object with predict"),
+    (WITHOUT_TUPLE, SHORT, r"predict must return a tuple \(action, state\), not ndarray"),
+    (CompensatedPID(), make_config(action="smooth", observation="measured"), "made for action='direct'.* has action"),
+    (RATE, SHORT, r"made for action='rate'.* has action='direct'"),
+    ("paper", SHORT, r"as make_controller\('paper', config\) makes one"),
+]
+WITH_SEED = partial(rollout, OpenLoop(), seeds=[1])
+MAKERS = [CzEnv.from_config, partial(make_controller, "lqg"), partial(load, "ppo"), WITH_SEED]
+A_CONFIG = r"needs a Config, not 'hard': cz_gym.config.make_config\('hard'\) makes one"
+WHOLE = "seeds must be a sequence of at least one whole number from 0 on"
+SEQUENCES = [[], 3, 5.0, "12", [1.0], [[1]], [-1], {1}, np.array([True])]
+TAKEOVERS = [({"seeds": []}, "at least one whole number")]
+TAKEOVERS += [({"at": at}, "must lie in the episode") for at in (-1.0, 601.0, float("nan"))]
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        *((partial(rollout, policy, config, [1]), ValueError, says) for policy, config, says in POLICIES),
+        *((partial(make, "hard"), ValueError, A_CONFIG) for make in MAKERS),
+        *((partial(rollout, OpenLoop(), SHORT, seeds), CzError, WHOLE) for seeds in SEQUENCES),
+        *(
+            (partial(replay, NOTHING, NOTHING, **{"config": CONFIG, "seeds": SEEDS, **given}), ValueError, says)
+            for given, says in TAKEOVERS
+        ),
+        *(
+            (partial(Playback, log), ValueError, "logged actions must be of shape")
+            for log in ([], [1.0, 2.0], np.zeros((3, 3)), np.zeros((0, 2)))
+        ),
+    ],
+)
+def test_what_cannot_be_rolled_out_is_refused(call, error, message):
+    with pytest.raises(error, match=message):
+        call()

@@ -14,12 +14,7 @@ from cz_gym.physics.parameters import MACHINE, SIZES, check_parameters
 from cz_gym.physics.plant import disturbance, hidden_load
 from cz_gym.physics.schedule import bias_offset, drift, pyrometer_drift, recipe, reference, ripple
 
-MINUTE = 60.0
 THREE_HOURS = 10800.0
-
-
-def episode(scenario):
-    return episode_from_key(SCENARIOS[scenario], (1, 2), new_series(10, 10))
 
 
 def test_quintic_has_no_rate_and_no_curvature_at_its_ends():
@@ -31,27 +26,33 @@ def test_quintic_has_no_rate_and_no_curvature_at_its_ends():
     assert (schedule.quintic(0.0), schedule.quintic(1.0)) == (0.0, 1.0)
 
 
-def test_paper_ramp_rises_half_a_kelvin_a_minute_for_ten_minutes():
-    e = episode("paper-ramp")
-    minutes = np.array([0.0, 10.0, 11.0, 15.0, 20.0, 90.0])
-    assert recipe(minutes * MINUTE, e) == pytest.approx([0.0, 0.0, 0.5, 2.5, 5.0, 5.0])
-    assert drift(60 * MINUTE, e) == 0.0
+STEPS = Episode(
+    recipe_start=600.0, recipe_duration=300.0, recipe_amount=2.0,
+    drift_start=0.0, drift_duration=1000.0, drift_amount=-4.0, drift_rate=0.1 / 60,
+    ring_offset=1e-4, bias_drift_start=1000.0, bias_drift_duration=1000.0, bias_drift_amount=-2e-4,
+    ripple_amplitude=1e-4, ripple_omega=2 * np.pi / 6.0, ripple_phase=np.pi / 2, pyrometer_drift=2.0,
+)  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "fall"), [("reference-a", -2.5e-3), ("reference-b", -0.5e-3)])
-def test_references_fall_over_half_an_hour(name, fall):
-    minutes = np.array([0.0, 10.0, 25.0, 40.0, 170.0])
-    expected = np.array([0.0, 0.0, 0.5, 1.0, 1.0]) * fall
-    assert reference(minutes * MINUTE, episode(name)) == pytest.approx(expected)
-
-
-def test_recipe_is_error_and_drift_together():
-    e = Episode(
-        recipe_start=600.0, recipe_duration=300.0, recipe_amount=2.0,
-        drift_start=0.0, drift_duration=1000.0, drift_amount=-4.0, drift_rate=0.1 / 60,
-    )  # fmt: skip
-    assert recipe(750.0, e) == pytest.approx(1.0 - 3.0 + 1.25)
-    assert drift(2000.0, e) == pytest.approx(-4.0 + 0.1 / 60 * 2000)
+@pytest.mark.parametrize(
+    ("schedule", "e", "times", "expected"),
+    [
+        (recipe, "paper-ramp", [0.0, 600.0, 660.0, 900.0, 1200.0, 5400.0], [0.0, 0.0, 0.5, 2.5, 5.0, 5.0]),
+        (drift, "paper-ramp", [3600.0], [0.0]),
+        (reference, "reference-a", [0.0, 600.0, 1500.0, 2400.0, 10200.0], [0.0, 0.0, -1.25e-3, -2.5e-3, -2.5e-3]),
+        (reference, "reference-b", [0.0, 600.0, 1500.0, 2400.0, 10200.0], [0.0, 0.0, -0.25e-3, -0.5e-3, -0.5e-3]),
+        (recipe, STEPS, [750.0], [1.0 - 3.0 + 1.25]),
+        (drift, STEPS, [2000.0], [-4.0 + 0.1 / 60 * 2000]),
+        (bias_offset, STEPS, [0.0, 1500.0, 9000.0], [1e-4, 0.0, -1e-4]),
+        (ripple, STEPS, [0.0, 3.0, 6.0], [1e-4, -1e-4, 1e-4]),
+        (pyrometer_drift, STEPS, [0.0, THREE_HOURS / 2, THREE_HOURS], [0.0, 1.0, 2.0]),
+    ],
+)
+def test_schedules_have_their_values_at_times(schedule, e, times, expected):
+    """The ramp rises 0.5 K/min for ten minutes, references fall over half an hour, a recipe is error and drift."""
+    if isinstance(e, str):
+        e = episode_from_key(SCENARIOS[e], (1, 2), new_series(10, 10))
+    assert schedule(np.array(times), e) == pytest.approx(expected)
 
 
 def test_disturbance_hides_the_drift_and_melts_the_charge_away():
@@ -62,16 +63,6 @@ def test_disturbance_hides_the_drift_and_melts_the_charge_away():
     assert d.dT_i == 0.7
     assert d.melt == pytest.approx(0.95)
     assert disturbance(2 * THREE_HOURS, 0.0, e, p).melt == pytest.approx(0.9)
-
-
-def test_errors_of_the_sensors_follow_their_schedule():
-    e = Episode(
-        ring_offset=1e-4, bias_drift_start=1000.0, bias_drift_duration=1000.0, bias_drift_amount=-2e-4,
-        ripple_amplitude=1e-4, ripple_omega=2 * np.pi / 6.0, ripple_phase=np.pi / 2, pyrometer_drift=2.0,
-    )  # fmt: skip
-    assert bias_offset(np.array([0.0, 1500.0, 9000.0]), e) == pytest.approx([1e-4, 0.0, -1e-4])
-    assert ripple(np.array([0.0, 3.0, 6.0]), e) == pytest.approx([1e-4, -1e-4, 1e-4])
-    assert pyrometer_drift(np.array([0.0, THREE_HOURS / 2, THREE_HOURS]), e) == pytest.approx([0.0, 1.0, 2.0])
 
 
 REFUSED = [
