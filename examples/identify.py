@@ -10,10 +10,11 @@ from cz_gym import CzEnv, Parameters
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.puller.file import PullerFile, find_puller, to_toml
+from cz_gym.puller.file import PullerFile, find_puller
 from cz_gym.support.files import write_files
 from cz_gym.tools.identify import Excited, identify, read_log, record_log
 from cz_gym.tools.identify.command import report
+from cz_gym.tools.identify.file import puller_text
 from cz_gym.tools.registry import make_controller
 
 
@@ -30,7 +31,7 @@ def main(log_file: str, start: str = "default", out: str = "runs/my.toml") -> fl
     log = read_log(log_file)
     identified = identify(log, find_puller(start))
     pages = report(identified, log, log_file, Path(out).with_suffix(".md"))
-    write_files(pages | {Path(out): to_toml(identified.puller).encode()})
+    write_files(pages | {Path(out): puller_text(identified, log_file, Path(out).stem).encode()})
     config = make_config("randomized", observation="measured", action="direct", puller=out)
     return float(metrics(rollout(make_controller("lqg", config), config, range(20))).rmse_mm.mean())
 

@@ -10,12 +10,20 @@ import numpy as np
 from cz_gym.baselines.margins import EXPLAINED, HEADS, shown
 from cz_gym.baselines.tuned_controllers import LQGS, PIDS
 from cz_gym.body.process import STATES, linearise, radius_model
+from cz_gym.camera.image import wall_edge
+from cz_gym.camera.view import camera_for, make_scene, make_view
 from cz_gym.config import make_config
+from cz_gym.crystal import recipe
+from cz_gym.crystal.plant import complete
+from cz_gym.crystal.process import lengths, nominal_recipe
+from cz_gym.episodes.draw import Episode
 from cz_gym.episodes.scenarios import RANDOMIZED
+from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.parameters import MACHINE, Parameters
 from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, make_puller
 from cz_gym.puller.file import PullerFile, defaults_of, doubts, find_puller, value_of
 from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.errors import CzError
 from cz_gym.support.units import CELSIUS, HOUR, KILO, MINUTE, MM, MM_PER_MIN
 from cz_gym.tools.report.tables import markdown
 
@@ -37,6 +45,7 @@ def implied(puller: PullerFile) -> dict[str, str]:
         f"temperature; lost at {puller.radius_limit / MM:.3g} mm from the reference",
         "left alone": ", ".join(f"Model {name} {_left_alone(q, lam)}" for name, lam in (("I", 1.0), ("II", 0.0))),
         "bright ring": f"{p.ring_bias / MM:.3g} mm outside the crystal, zero at {model.zero:.3g} rad/s",
+        "ring exists": _ring_exists(puller),
         "hot zone": f"time constants {', '.join(f'{lag:.3g}' for lag in lags)} min",
         "pull speed": f"{(2.0 * q.v_0 - fastest) / MM_PER_MIN:.4g} to {fastest / MM_PER_MIN:.4g} mm/min"
         + _stated(puller, "pull_slew"),
@@ -45,6 +54,37 @@ def implied(puller: PullerFile) -> dict[str, str]:
         "sensors": f"every {puller.control_interval:g} s"
         + _stated(puller, "camera_noise", "pyrometer_noise", "latency", "pyrometer_filter"),
     }
+
+
+def _ring_exists(puller: PullerFile) -> str:
+    """Say where along the crystal the meniscus is steep enough to mirror the crucible's wall into the default camera,
+    whose line of sight decides: in a body, along its recipe, and down to which height of the meniscus.
+    """
+    q, p = puller.parameters, make_puller(puller.parameters)
+    view = make_view(camera_for(q))
+
+    def needed(r_c: float, h_c: float) -> float:
+        return wall_edge(make_scene(r_c, h_c, p), view).slope
+
+    steep, slope = math.degrees(0.5 * math.pi - q.alpha_0), math.degrees(needed(q.r_0, p.h_0))
+    if math.isnan(slope):
+        return f"nowhere in a body: the meniscus rises by {steep:.3g} deg at the crystal, too little for the camera"
+    text = f"in a body, whose meniscus rises by {steep:.3g} deg at the crystal (the camera needs {slope:.3g})"
+    low, high = HEIGHT_MIN, p.h_0
+    for _ in range(20):
+        low, high = (middle, high) if math.isnan(needed(q.r_0, middle := 0.5 * (low + high))) else (low, middle)
+    text += f" at heights of {high / MM:.3g} mm and more"
+    try:
+        constants, table = nominal_recipe(complete(q, puller), HURLE)
+    except CzError:
+        return text
+    rows = slice(recipe.MARGIN, recipe.ROWS - recipe.MARGIN, 3)
+    along, heights = lengths(constants)[rows], table[rows, recipe.RecipeRow._fields.index("h_c")]
+    radii = [float(recipe.shape_at(L, constants, Episode()).r) for L in along]
+    seen = [not math.isnan(needed(r_c, float(h_c))) for r_c, h_c in zip(radii, heights, strict=True)]
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], seen, [0]])))
+    parts = ", ".join(f"{along[a] / MM:.0f} to {along[b - 1] / MM:.0f}" for a, b in ends.reshape(-1, 2))
+    return f"{text}; along its recipe's crystal at {parts or 'no'} mm"
 
 
 def _left_alone(parameters: Parameters, lam: float) -> str:

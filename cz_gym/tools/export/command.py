@@ -11,7 +11,7 @@ from cz_gym.support.command_line import OneLineParser, relative_path
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import write_files
 from cz_gym.support.units import KILO, MM_PER_MIN
-from cz_gym.tools.identify.log import read_log
+from cz_gym.tools.identify.log import add_log_options, read_given
 
 from .block import Alarm, meanings
 from .controllers import make_block
@@ -31,6 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--plant", action="store_true", help="the puller in place of a controller (--to fmu)")
     add("--to", choices=("c", "fmu", "st"), help="C99, FMI, IEC 61131-3 structured text")
     add("--shadow", type=Path, metavar="LOG", help="in place of --to: run the controller beside a log, and report")
+    add_log_options(parser)
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
     parser.add_puller("its nominal values, its drives' limits, what is designed for it")
     add("--scenario", metavar="NAME",
@@ -53,7 +54,7 @@ def _export(given: argparse.Namespace) -> None:
         return
     block = make_block(given.controller, config)
     if given.shadow:
-        files = shadow(block, read_log(given.shadow))
+        files = shadow(block, read_given(given.shadow, given))
     else:
         files = WRITERS[given.to](block.program, given.real == "float") | {"vector.csv": test_vector(block)}
         files["README.md"] = readme(block, list(files), given.real == "float")

@@ -6,7 +6,6 @@ not.
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from cz_gym.episodes.scenario import to_csv
 from cz_gym.evaluation.plots import COLOURS, GREY, INK, canvas, png
 from cz_gym.physics.parameters import describe
 from cz_gym.physics.plant import make_puller
-from cz_gym.puller.file import PullerFile, find_puller, to_toml
+from cz_gym.puller.file import PullerFile, find_puller
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import check_writable, write_files
@@ -23,7 +22,8 @@ from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN, PERCENT
 from cz_gym.tools.report.tables import markdown
 
 from .estimate import COLOURED, SENSORS, Estimate, Identified, coloured, identify
-from .log import COLUMNS, Log, check_puller, column_map, read_log
+from .file import puller_text
+from .log import COLUMNS, Log, add_log_options, check_puller, read_given
 from .model import Lags
 
 NO_FIT = 3
@@ -112,16 +112,18 @@ def _moved(share: float) -> str:
 def _calliper(identified: Identified) -> str:
     """Say how well phi_b would be known from the ring's offset and a calliper reading of the crystal."""
     parameters = (identified.start if identified.misfits else identified.puller).parameters
-    log, step = identified.log, 1e-4
+    step = 1e-4
     ring = make_puller(parameters).ring_bias
     slope = (make_puller(parameters._replace(phi_b=parameters.phi_b + step)).ring_bias - ring) / step
-    meant = np.where(np.isfinite(log.r_ref), log.r_ref, parameters.r_0)
-    middle = float(np.nanmedian(log.ring - meant))
+    middle, (gain, sd) = identified.ring_outside, identified.ring_gain
+    share = f"{gain:.2f} times as much as the file's (standard deviation {sd:.2f})"
+    moves = f" With the meniscus' height it moves {share}." if np.isfinite(sd) else ""
     return (
         f"The ring is {middle / MM:.2f} mm outside the reference, in the middle of the log; with phi_b = "
-        f"{np.degrees(parameters.phi_b):.2f} deg it is {ring / MM:.2f} mm outside the crystal. The log cannot say how "
-        f"much of the difference is an error of the radius. A calliper reading of the crystal, to {CALLIPER / MM:g} mm "
-        f"of its radius, gives phi_b to {np.degrees(CALLIPER / abs(slope)):.2g} deg, and with it the true radius."
+        f"{np.degrees(parameters.phi_b):.2f} deg it is {ring / MM:.2f} mm outside the crystal.{moves} The log "
+        "cannot say how much of the difference is an error of the radius. A calliper reading of the crystal, to "
+        f"{CALLIPER / MM:g} mm of its radius, gives phi_b to {np.degrees(CALLIPER / abs(slope)):.2g} deg, "
+        "and with it the true radius."
     )
 
 
@@ -174,9 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--out", type=Path, required=True, help="puller file to write; its report stands beside it")
     about = "write the load on the melt and the fluctuations of the log too, as a scenario: scenario='FILE.csv'"
     add("--series", type=Path, metavar="FILE.csv", help=about)
-    named = "NAME=COLUMN[:UNIT]"
-    add("--column", action="append", default=[], metavar=named, help="a column with another name or unit")
-    add("--columns", type=Path, metavar="FILE", help='TOML file with lines NAME = "COLUMN:UNIT"')
+    add_log_options(parser)
     add("--prior", action="append", default=[], metavar="NAME=SD", help="sd of the logarithm of a start value")
     add("--force", action="store_true", help="write the puller file although the model does not fit the log")
     return parser.run(_main, arguments, "plant")
@@ -196,16 +196,19 @@ def _check_outputs(given: argparse.Namespace, start: PullerFile) -> None:
 def _main(given: argparse.Namespace) -> int:
     start = find_puller(given.puller)
     _check_outputs(given, start)
-    logs = [read_log(path, column_map(given.column, given.columns)) for path in given.log]
+    logs = [read_given(path, given) for path in given.log]
     for path, log in zip(given.log, logs, strict=True):
         check_puller(log, start, str(path))
     identified = identify(logs, start, dict(map(_prior, given.prior)))
     page, files = given.out.with_suffix(".md"), dict[Path, bytes]()
+    names = ", ".join(path.name for path in given.log)
     if given.force or not identified.misfits:
-        files[given.out] = to_toml(replace(identified.puller, name=given.out.stem)).encode()
+        files[given.out] = puller_text(identified, names, given.out.stem).encode()
         files |= {given.series: to_csv(identified.series()).encode()} if given.series else {}
     print(identified.verdict)
-    write_files(report(identified, logs, ", ".join(path.name for path in given.log), page) | files)
+    for path, log in zip(given.log, logs, strict=True):
+        print(*(f"{path.name}: {note}" for note in log.notes), sep="\n", end="\n" if log.notes else "")
+    write_files(report(identified, logs, names, page) | files)
     for e in identified.estimates:
         said = f"{e.value:.4g} ({e.low:.4g} to {e.high:.4g})" if e.informed else "this log says nothing about it"
         print(f"{e.name}: {said}")

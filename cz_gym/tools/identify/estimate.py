@@ -4,7 +4,7 @@ Prediction errors, operating point and noise at the maximum say whether the mode
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -18,14 +18,28 @@ from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.units import KILO, MM
 
 from .log import Floats, Log, join_logs, prepare, shift_drives
-from .model import FAST, LAM, LOAD, SLOW, Lags, Model, NoiseLevels, Predicted, sensitivities, smooth
+from .model import (
+    FAST,
+    LAM,
+    LOAD,
+    RING_GAIN,
+    SLOW,
+    TAU_FAST,
+    TAU_SLOW,
+    Lags,
+    Model,
+    NoiseLevels,
+    Predicted,
+    sensitivities,
+    smooth,
+)  # fmt: skip
 from .moves import measure_excitation
 
 SENSORS = "pyrometer", "ring"
 """Sensors in the order of prediction errors."""
 HEATER = ("C_1", "C_2", "C_b", "kappa_12", "G_1a", "G_2b", "eps", "k_l")
 """Parameters of the path from the heater."""
-PULL = ("sigma", "lam")
+PULL = ("sigma", "rho_l", "alpha_0", "lam")
 """Parameters of the path from the pull speed to the ring; ``lam`` stands for the product lam dT_0."""
 LAGS = Lags._fields
 """Delays of the heater's path; a log tells their sum better than each."""
@@ -34,6 +48,13 @@ SHORT, LAG_SD, DEAD_SD = 2.0, 1.5, 5.0
 time [s]."""
 PRIOR_SD, NOISE_SD = 0.35, 1.0
 """Standard deviation of the logarithm of a parameter, and of the strength of a noise [-]."""
+MATERIAL_SD = {
+    "sigma": (0.05, "handbooks of silicon: 0.72 to 0.83 N/m"),
+    "k_l": (0.1, "handbooks of silicon: 54 to 67 W/m/K"),
+    "rho_l": (0.01, "handbooks of silicon: 2510 to 2570 kg/m3"),
+    "alpha_0": (0.1, "measured growth angles of silicon: 11 deg, 1 deg more or less"),
+}
+"""Material constants: standard deviation of the logarithm [-], and where it comes from."""
 LAM_SD = 0.3
 """Standard deviation of lam [-]; with the mean LAM about that of a uniform distribution."""
 WIDER = 1.3
@@ -87,6 +108,12 @@ class Identified:
     """Logs in the rows that were estimated from."""
     settled: bool
     """True if the search has ended at a maximum."""
+    ring_gain: tuple[float, float] = (1.0, np.inf)
+    """Factor on the file's ring-to-height gain that the log asks for, and its logarithm's standard deviation [-]."""
+    sds: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviations of the priors by name."""
+    told_sds: tuple[str, ...] = ()
+    """Names of those that were told, in place of handbooks' and the usual ones."""
     misfits: tuple[str, ...] = ()
     """Reasons why the model does not fit the log, in words; empty if it does."""
 
@@ -94,6 +121,13 @@ class Identified:
     def log(self) -> Log:
         """Logs one after the other."""
         return join_logs(self.logs)
+
+    @property
+    def ring_outside(self) -> float:
+        """Distance of the ring from the reference in the middle of the log; from r_0 if it has none [m]."""
+        log = self.log
+        meant = np.where(np.isfinite(log.r_ref), log.r_ref, self.start.parameters.r_0)
+        return float(np.nanmedian(log.ring - meant))
 
     def series(self, meniscus: MeniscusModel = HURLE) -> list[tuple[Floats, Floats, Floats]]:
         """Times [s], load on the melt [W] and fluctuation of the interface [K] of each log, from a smoother.
@@ -109,7 +143,8 @@ class Identified:
 
     @property
     def puller(self) -> PullerFile:
-        """Start file with the numbers that the log tells: parameters, lags, and the noise of camera and pyrometer.
+        """Start file with the numbers that the log tells: parameters, lags, fluctuations of the melt, and the noise of
+        camera and pyrometer.
 
         ``lam`` is not among them: each crystal of a scenario draws its own. Where the model does not fit, the numbers
         are the ones that explain the log best.
@@ -120,6 +155,9 @@ class Identified:
         ranges |= {e.name: max(e.value, 0.0) for e in self.estimates if e.name in LAGS and e.excited and self.delayed}
         parameters = {name: value for name, value in sure.items() if name in Parameters._fields}
         own: dict[str, Any] = {name: (value, value) for name, value in ranges.items()}
+        if {"fast_sd", "slow_sd"} <= set(sure):
+            sds = sorted((sure["fast_sd"], sure["slow_sd"]))
+            own |= {"fluctuation_sd": tuple(sds), "tau_fast": TAU_FAST, "tau_slow": TAU_SLOW}
         return replace(self.start, parameters=self.start.parameters._replace(**parameters), **own)
 
     @property
@@ -144,11 +182,12 @@ def identify(
 ) -> Identified:
     """Estimate what one or several logs tell of a puller; parameters of a path that is not excited are left alone.
 
-    ``start`` holds the prior's medians, ``prior_sd`` standard deviations of logarithms other than PRIOR_SD. Drives that
-    seem to act before they do are moved by a row: the log's row then holds what came after its readings.
+    ``start`` holds the prior's medians, ``prior_sd`` standard deviations of logarithms other than those of
+    :func:`prior_sds`. Drives that seem to act before they do are moved by a row: the log's row then holds what came
+    after its readings.
     """
     logs = (log,) if isinstance(log, Log) else tuple(log)
-    sds = _prior_sds(prior_sd or {})
+    sds = prior_sds(prior_sd or {})
     pull, heater = measure_excitation(logs, start)
     free = (*((*HEATER, *LAGS) if heater >= 1.0 else ()), *(PULL if pull >= 1.0 else ()))
     model = Model((*free, *NoiseLevels._fields), start.parameters, meniscus, _lags_of(start, heater >= 1.0))
@@ -165,23 +204,30 @@ def identify(
         if name not in model.names:
             return Estimate(name, usual, usual, usual, usual, 1.0, excited=False)
         j = model.names.index(name)
-        low, value, high = (model.value(name, best.theta[j] + sign * 1.96 * best.sd[j]) for sign in (-1.0, 0.0, 1.0))
+        deviation = min(best.sd[j], sd[j])  # WIDER is no reason to know less than before
+        low, value, high = (model.value(name, best.theta[j] + sign * 1.96 * deviation) for sign in (-1.0, 0.0, 1.0))
         delay = name not in LAGS or np.subtract(*(_delay(best, model) * (1.0, 2.0))) > 0.5 * logs[0].interval
-        return Estimate(name, usual, value, low, high, best.sd[j] / sd[j], trusted=bool(delay))
+        return Estimate(name, usual, value, low, high, deviation / sd[j], trusted=bool(delay))
 
     whole = join_logs(rows)
     read = np.isfinite([whole.T_1, whole.ring]).T
     errors = np.where(read, best.out.error / np.sqrt(best.out.variance), np.nan)
     told, noise = tuple(map(estimate, (*HEATER, *LAGS, *PULL))), tuple(map(estimate, NoiseLevels._fields))
-    result = Identified(start, told, noise, (pull, heater), errors, best.out, tuple(rows), best.settled)
+    gain = _ring_gain(rows, model, best, sd) if pull >= 1.0 else (1.0, np.inf)
+    result = Identified(start, told, noise, (pull, heater), errors, best.out, tuple(rows), best.settled, gain, sds)
+    result = replace(result, told_sds=tuple(prior_sd or ()))
     away = dict(zip(model.names, (best.theta - model.mean) / sd, strict=True))
     if reasons := misfits(result, model.puller(best.theta + 0j), away):
         told, noise = (tuple(e._replace(trusted=False) for e in each) for each in (told, noise))
     return replace(result, estimates=told, noise=noise, misfits=reasons)
 
 
-def _prior_sds(given: Mapping[str, float]) -> dict[str, float]:
+def prior_sds(given: Mapping[str, float]) -> dict[str, float]:
+    """Standard deviations of the priors by name: those of handbooks for a material's constants, PRIOR_SD for the hot
+    zone's; ``given`` has others. CzError for names that there are not.
+    """
     sds = dict.fromkeys((*HEATER, *PULL), PRIOR_SD) | dict.fromkeys(NoiseLevels._fields, NOISE_SD) | {"lam": LAM_SD}
+    sds |= {name: sd for name, (sd, _) in MATERIAL_SD.items()}
     sds |= {"heater_lag": LAG_SD, "pyrometer_filter": LAG_SD, "heater_dead_time": DEAD_SD}
     for name, value in given.items():
         if name not in sds or not 0.0 < value < np.inf:
@@ -232,16 +278,10 @@ def _maximise(logs: Sequence[Log], model: Model, sd: Floats) -> Maximum:
     @lru_cache(maxsize=2)
     def posterior(packed: bytes) -> tuple[float, Floats, Floats, Predicted]:
         away = np.frombuffer(packed)
-        parts = [sensitivities(log, model, model.mean + away * sd) for log in logs]
-        out = Predicted(*(np.concatenate(each) for each in zip(*(part[0] for part in parts), strict=True)))
-        E, S = (np.concatenate([part[k] for part in parts], axis=1) for k in (1, 2))
-        e, s = out.error, out.variance
-        if not (np.isfinite(E).all() and np.isfinite(S).all() and s.min() > 0.0):
+        value, slope, information, out = _likelihood(logs, model, model.mean + away * sd)
+        if not np.isfinite(value):
             return np.inf, np.zeros(len(away)), np.eye(len(away)), out
-        slope = np.sum(e * E / s + 0.5 * S / s * (1.0 - e * e / s), axis=(1, 2)) * sd + away
-        A, B = ((part.reshape(len(away), -1).T * sd).T for part in (E / np.sqrt(s), S / s))
-        value = 0.5 * float(np.sum(np.log(s) + e * e / s) + away @ away)
-        return value, slope, A @ A.T + 0.5 * B @ B.T + np.eye(len(away)), out
+        return value + 0.5 * away @ away, slope * sd + away, information * np.outer(sd, sd) + np.eye(len(away)), out
 
     def part(index: int) -> Callable[[Floats], Any]:
         return lambda x: posterior(x.tobytes())[index]
@@ -261,6 +301,35 @@ def _maximise(logs: Sequence[Log], model: Model, sd: Floats) -> Maximum:
         settled = len(values) <= options["maxiter"]
     _, _, curvature, out = posterior(away.tobytes())
     return Maximum(model.mean + away * sd, WIDER**2 * np.linalg.inv(curvature) * np.outer(sd, sd), out, settled)
+
+
+def _likelihood(logs: Sequence[Log], model: Model, theta: Floats) -> tuple[float, Floats, Floats, Predicted]:
+    """Minus the logarithm of the likelihood (infinite where the filter fails), its slope, its information, and the
+    filter's output.
+    """
+    parts = [sensitivities(log, model, theta) for log in logs]
+    out = Predicted(*(np.concatenate(each) for each in zip(*(part[0] for part in parts), strict=True)))
+    E, S = (np.concatenate([part[k] for part in parts], axis=1) for k in (1, 2))
+    e, s = out.error, out.variance
+    if not (np.isfinite(E).all() and np.isfinite(S).all() and s.min() > 0.0):
+        return np.inf, np.zeros(len(theta)), np.eye(len(theta)), out
+    slope = np.sum(e * E / s + 0.5 * S / s * (1.0 - e * e / s), axis=(1, 2))
+    A, B = (part.reshape(len(theta), -1) for part in (E / np.sqrt(s), S / s))
+    return 0.5 * float(np.sum(np.log(s) + e * e / s)), slope, A @ A.T + 0.5 * B @ B.T, out
+
+
+def _ring_gain(logs: Sequence[Log], model: Model, best: Maximum, sd: Floats) -> tuple[float, float]:
+    """Factor on the ring-to-height gain that the log asks for beside the estimates, and its logarithm's sd [-].
+
+    One step of Newton's method from the maximum, with the factor free and without a prior.
+    """
+    wider = model._replace(names=(*model.names, RING_GAIN))
+    _, slope, information, _ = _likelihood(logs, wider, np.append(best.theta, 0.0))
+    precision = np.append(sd**-2.0, 0.0)
+    slope = slope + precision * np.append(best.theta - model.mean, 0.0)
+    covariance = np.linalg.pinv(information + np.diag(precision), hermitian=True)
+    step = -(covariance @ slope)[-1]
+    return float(np.exp(np.clip(step, -3.0, 3.0))), float(WIDER * np.sqrt(covariance[-1, -1]))
 
 
 def _plausible_start(logs: Sequence[Log], model: Model, sd: Floats) -> Floats:
@@ -293,6 +362,10 @@ PRIOR_END = 3.0
 """Standard deviations of its prior from which on an estimate stands at its end."""
 T_1_OFF, Q_H_OFF = 15.0, 0.06
 """Largest differences of the model's operating point and the log's means: T_1 [K], share of the power [-]."""
+RING_OFF = 1.5 * MM
+"""Largest difference of the file's ring, seen from the crystal, and the log's, seen from the reference [m]."""
+GAIN_OFF = 0.25, 3.0
+"""Deviation of the ring-to-height gain from which on it is judged [-], in its standard deviations too."""
 NOISE_RATIO = 2.5
 """Largest ratio of a sensor's noise to what the start file says."""
 
@@ -310,6 +383,7 @@ def misfits(identified: Identified, puller: Any, away: Mapping[str, float]) -> t
     reasons += _coloured_errors(identified, SENSORS if heater else SENSORS[1:])
     if heater:
         reasons += _off_the_operating_point(identified.log, puller)
+    reasons += _another_ring(identified, float(puller.ring_bias.real))
     parameters = {e.name for e in identified.estimates} - set(LAGS)
     ends = [f"{name} ({by:+.1f})" for name, by in away.items() if (abs(by) if name in parameters else by) > PRIOR_END]
     if ends:
@@ -339,6 +413,21 @@ def _off_the_operating_point(log: Log, puller: Any) -> list[str]:
         reasons.append(f"its T_1 is {puller.T_1_0.real:.0f} K where the log's mean is {T_1:.0f} K")
     if abs(puller.Q_H_0.real / Q_H - 1.0) > Q_H_OFF:
         reasons.append(f"it needs {puller.Q_H_0.real / KILO:.1f} kW where the log's mean is {Q_H / KILO:.1f} kW")
+    return reasons
+
+
+def _another_ring(identified: Identified, bias: float) -> list[str]:
+    """Compare the ring's distance from the crystal, and its gain by the meniscus' height, with the log's."""
+    file, seen, (gain, sd) = identified.start, identified.ring_outside, identified.ring_gain
+    room = RING_OFF + sum(np.abs(offset or (0.0,)).max() for offset in (file.bias_offset, file.level_offset))
+    reasons = []
+    if abs(bias - seen) > room:
+        reasons.append(
+            f"its ring is {bias / MM:.1f} mm outside the crystal where the log's is {seen / MM:.1f} mm outside the "
+            "reference (sigma, phi_b or the radius is another)"
+        )
+    if abs(np.log(gain)) > max(np.log1p(GAIN_OFF[0]), GAIN_OFF[1] * sd):
+        reasons.append(f"the log's ring moves {gain:.2g} times as much with the meniscus' height as the file's")
     return reasons
 
 

@@ -7,6 +7,7 @@ conversion of a column would tell neither. The grid follows the times of the row
 
 import csv
 import io
+import re
 import tomllib
 import warnings
 from collections.abc import Mapping, Sequence
@@ -28,7 +29,8 @@ Units = dict[str, tuple[float, float]]
 INCH, DAY = 25.4 * MM, 24.0 * HOUR
 DATED = {"iso": "2026-03-01 12:00:05", "dmy": "01.03.2026 12:00:05", "mdy": "03/01/2026 12:00:05", "clock": "12:00:05"}
 """Times that are no numbers, each with an example; ``clock``, the time of day, may run over midnight."""
-TIME: Units = {name: (size, 0.0) for name, size in (("s", 1.0), ("min", MINUTE), ("h", HOUR), ("ms", 1e-3))}
+TIME: Units = {"s": (1.0, 0.0), "min": (MINUTE, 0.0), "h": (HOUR, 0.0), "d": (DAY, 0.0)}
+TIME |= {"ms": (1e-3, 0.0), "us": (1e-6, 0.0), "ns": (1e-9, 0.0)}
 TIME |= dict.fromkeys(DATED, (1.0, 0.0))
 LENGTH = {"mm": MM, "cm": 10.0 * MM, "m": 1.0, "in": INCH}
 RADIUS: Units = {unit: (size, 0.0) for unit, size in LENGTH.items()}
@@ -45,28 +47,39 @@ COLUMNS: dict[str, Units] = {
     "valid": {"1": (1.0, 0.0)},
     "r_ref_mm": RADIUS,
     "T_1_ref_K": TEMPERATURE,
+    "frame_time_s": TIME,
 }
 """Columns of a log, with the units that each may have; the first is its own."""
-REQUIRED = tuple(COLUMNS)[:5]
-"""Columns that a log must have."""
+REQUIRED, RECORDED = tuple(COLUMNS)[:5], tuple(COLUMNS)[:8]
+"""Columns that a log must have, and those that :func:`record_log` writes."""
 DRIVES = "pull_speed_mm_per_min", "heater_power_kW"
-ABSENT = ("", "nan", "null", "none", "na", "n/a", "#n/a", "-", "--", "---", "<na>", "nat")
+ABSENT = ("", "nan", "null", "none", "na", "n/a", "#n/a", "-", "--", "---", "<na>", "nat", "1.#qnan", "-1.#ind")
 """Fields that hold no number."""
+MEANT = "on", "off", "true", "false"
+"""Words that stand for a number, so that they are not missing."""
+WORDS = 0.2
+"""Largest share of a column's fields that may be words in place of numbers, as historians write them."""
+GOOD = "good", "true", "yes", "y", "ok", "valid", "t"
+BAD = "bad", "false", "no", "n", "invalid", "f", "uncertain", "questionable", "error", "fail"
+"""Words of a quality; what is uncertain is not valid."""
 TOP = 100
 """Lines of a file among which its columns are named."""
 
 
-def read_fields(path: Path, wanted: set[str]) -> tuple[Any, int]:
-    """Read a file's fields as text, and the line of its first row; the line above names most of the ``wanted`` columns.
+def read_fields(path: Path, wanted: set[str], notes: dict[str, int]) -> Any:
+    """Read a file's fields as text, by the row of the file; the line above names most of the ``wanted`` columns.
 
-    CzError for a file that is no table.
+    Rows end at line feeds (carriage return or not) and nowhere else. CzError for a file that is no table.
     """
     import pandas
 
     try:
         if path.suffix == ".parquet":
-            return pandas.read_parquet(path).reset_index(drop=True).astype(str), 2
-        lines = _decoded(path.read_bytes()).rstrip().splitlines()
+            table = pandas.read_parquet(path)
+            named = any(table.index.names) or not isinstance(table.index, pandas.RangeIndex)
+            table = table.reset_index(drop=not named).astype(str)
+            return table.set_axis(range(2, len(table) + 2))
+        lines = _decoded(path.read_bytes()).rstrip("\0 \t\r\n").split("\n")
         wanted |= {part for name in wanted for part in name.split("+")}
         places = [(n, separator) for n in range(min(len(lines), TOP)) for separator in ",;\t|"]
 
@@ -75,70 +88,239 @@ def read_fields(path: Path, wanted: set[str]) -> tuple[Any, int]:
             return len(wanted & set(fields)), len(fields)
 
         top, separator = max(places, key=matches, default=(0, ","))
-        asked: Any = {"dtype": str, "keep_default_na": False, "skip_blank_lines": False, "index_col": False}
-        table = pandas.read_csv(io.StringIO("\n".join(lines[top:])), sep=separator, **asked)
         names = _fields(lines[top], separator)
-        return table.set_axis(names[: table.shape[1]], axis=1), top + 2
-    except ValueError as error:  # an empty file, or rows of another length
+        whole, rows = _without_nuls(lines[top:], len(names), separator)
+        notes["rows are lost in NUL bytes, as after a power failure"] = len(lines) - top - len(whole)
+        asked: Any = {"dtype": str, "keep_default_na": False, "skip_blank_lines": False, "index_col": False}
+        text = "\n".join(whole)
+        table = pandas.read_csv(io.StringIO(text), sep=separator, lineterminator="\n", **asked)
+        table = table.set_axis(names[: table.shape[1]], axis=1)
+        same = len(table) == len(rows) - 1  # else a quoted field runs over several lines
+        return table.set_axis(np.array(rows[1:]) + top + 1 if same else range(top + 2, len(table) + top + 2))
+    except (ValueError, csv.Error) as error:  # an empty file, or rows of another length
         raise CzError(" ".join(str(error).split())) from None
 
 
 def _decoded(raw: bytes) -> str:
-    text = raw.decode("utf-16") if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else ""
-    try:
-        text = text or raw.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = raw.decode("latin-1")
-    if "\0" in text:
-        raise CzError("not a text file")
-    return text
+    """Decode text of any usual coding, with rows that end at line feeds; CzError for what is none."""
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        text = raw.decode("utf-16")
+    elif raw[1:200:2].count(0) > 60:
+        text = raw.decode("utf-16-le")
+    else:
+        for coding in ("utf-8-sig", "cp1252", "latin-1"):
+            try:
+                text = raw.decode(coding)
+                break
+            except UnicodeDecodeError:
+                pass
+    text = text.replace("\r\n", "\n")
+    if re.search("[^\\0]\0[^\\0]", text) or text.strip("\0") == "":
+        raise CzError("not a text file" if text.strip("\0") else "it is empty, or holds NUL bytes alone")
+    return text if "\n" in text else text.replace("\r", "\n")
+
+
+def _without_nuls(lines: Sequence[str], count: int, separator: str) -> tuple[list[str], list[int]]:
+    """Leave out what NUL bytes have cut: a row counts if all its fields stand behind them. Returns rows and places."""
+    whole, places = [], []
+    for place, line in enumerate(lines):
+        rest = line.rpartition("\0")[2]
+        if rest is line or "\0" not in line or len(_fields(rest, separator)) == count:
+            whole.append(rest)
+            places.append(place)
+    return whole, places
 
 
 def _fields(line: str, separator: str) -> list[str]:
-    return [field.strip() for field in next(csv.reader([line], delimiter=separator), [])]
+    return [field.strip() for field in next(csv.reader([line.replace("\r", " ")], delimiter=separator), [])]
 
 
-def parse_times(column: Any, unit: str, line: int, notes: dict[str, int]) -> tuple[Any, int]:
-    """Parse times [s] from the first to the last row that has one, and count the rows before; CzError names a row."""
+def select_rows(table: Any, where: Sequence[str]) -> Any:
+    """Select the rows in which each COLUMN=VALUE holds; several values of a column are alternatives.
+
+    CzError for a column that there is not, and where no row is left.
+    """
+    wanted: dict[str, list[str]] = {}
+    for each in where:
+        column, sign, value = (part.strip() for part in each.partition("="))
+        if not sign or not column:
+            raise CzError(f"--where {each}: write it as COLUMN=VALUE")
+        if column not in table:
+            raise CzError(unknown_name_message("column", column, table))
+        wanted.setdefault(column, []).append(value)
+    for column, values in wanted.items():
+        text = table[column].fillna("").str.strip()
+        chosen = text.isin(values)
+        if not chosen.any():
+            held = ", ".join(f"{value!r} ({count} rows)" for value, count in text.value_counts()[:6].items())
+            raise CzError(f"no row has {column} = {' or '.join(map(repr, values))}; it holds {held or 'nothing'}")
+        table = table[chosen]
+    return table
+
+
+def parse_times(column: Any, unit: str, notes: dict[str, int]) -> Any:
+    """Parse times [s] from the first to the last row that has one; CzError names a row."""
     text = column.fillna("").str.strip()
-    times, absent = _read_times(text, unit), text.str.lower().isin(ABSENT)
+    (times, naive), absent = _read_times(text, unit), text.str.lower().isin(ABSENT)
     good = np.flatnonzero(times.notna())
     if not len(good):
-        row = int((~absent).argmax()) if len(text) else 0
-        meant = [other for other in TIME if len(text) and np.isfinite(_read_times(text[[row]], other)).all()]
-        hint = f": did you mean time_s={column.name}:{meant[0]}?" if meant else ""
-        raise CzError(f"row {row + line}: {column.name} = {text.get(row, '')!r} is no time in {unit}{hint}")
+        row = (~absent).idxmax() if len(text) else 0
+        raise CzError(
+            f"row {row}: {column.name} = {text.get(row, '')!r} is no time in {unit}"
+            f"{_units_meant(text[~absent], str(column.name))}"
+        )
     first, end = int(good[0]), int(good[-1]) + 1
     notes["rows above or below the table have no time"] = first + len(text) - end
     inside = times.iloc[first:end]
     if inside.isna().any():
-        row = int(inside.isna().argmax()) + first
-        what = "the time is missing" if absent[row] else f"{column.name} = {text[row]!r} is no time in {unit}"
-        raise CzError(f"row {row + line}: {what}")
+        row = inside.isna().idxmax()
+        hint = "" if absent[row] else _units_meant(text.iloc[first:end][~absent], str(column.name))
+        what = "the time is missing" if absent[row] else f"{column.name} = {text[row]!r} is no time in {unit}{hint}"
+        raise CzError(f"row {row}: {what}")
     if unit in DATED:
         step = inside.diff()
         inside = inside + DAY * (step < -0.5 * DAY).cumsum() * (unit == "clock")
         again = (step > -HOUR) & (step <= -0.9 * HOUR)
         notes["hours are repeated, as at the end of summer time: the times below are an hour later"] = int(again.sum())
         inside = inside + HOUR * again.cumsum()
-    return inside, first
+        left_out = _hours_left_out(inside) if naive else again & False
+        notes["hours are left out, as at the beginning of summer time: the times below are an hour earlier"] = int(
+            left_out.sum()
+        )
+        inside = inside - HOUR * left_out.cumsum()
+    return inside
 
 
-def _read_times(text: Any, unit: str) -> Any:
-    """Parse times [s]; NaN where a field is none."""
+def _hours_left_out(times: Any) -> Any:
+    """Find rows before which the clock was put forward: an hour and a usual step, from the end of an hour of the night
+    on a Sunday (of a time of day without date, on any day).
+    """
+    step, before = times.diff(), times.shift()
+    most = 1.6 * step.median()
+    sunday = (before < 10.0 * DAY) | ((before // DAY) % 7 == 3.0)  # the first of January 1970 was a Thursday
+    at_end = ((-before) % HOUR <= most) & (before % DAY <= 3.0 * HOUR) | (before % DAY >= DAY - most)
+    return (step > HOUR) & (step <= HOUR + most) & sunday & at_end
+
+
+def _units_meant(text: Any, name: str) -> str:
+    """Hint at the units in which rows all over the column are times that grow as a log's; empty if there is none."""
+    if len(text) < 2:
+        return ""
+    far = text.iloc[np.unique(np.linspace(0, len(text) - 1, 500).astype(int))]
+    meant = []
+    for unit in TIME:
+        times, near = _read_times(far, unit)[0], _read_times(text.iloc[:500], unit)[0]
+        backwards = (times.diff() < -1.1 * HOUR).sum() > (len(text) if unit == "clock" else 0)
+        step = near.diff().abs().median()
+        if times.notna().mean() > 0.95 and not backwards and (step <= INTERVALS[1]):
+            meant.append((INTERVALS[0] <= step, unit, times.max() - times.min()))
+    units = [unit for good, unit, _ in meant if good or not any(each for each, *_ in meant)]
+    spans = {unit: span for _, unit, span in meant if unit in ("dmy", "mdy")}
+    units = [unit for unit in units if spans.get(unit, 0.0) <= 3.0 * min(spans.values(), default=0.0)]
+    if {"dmy", "mdy"} <= set(units) and "." in text.iloc[0][:6]:
+        units.remove("mdy")  # nobody writes the month first between dots
+    if not units:
+        return ""
+    return f": did you mean {' or '.join(f'time_s={name}:{unit}' for unit in units)}?"
+
+
+MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
+MONTH = {name: n + 1 for n, name in enumerate(MONTHS)}
+MONTH |= {
+    "mär": 3,
+    "mrz": 3,
+    "mae": 3,
+    "mai": 5,
+    "okt": 10,
+    "dez": 12,
+    "fév": 2,
+    "fev": 2,
+    "avr": 4,
+    "jui": 7,
+    "aoû": 8,
+}
+MONTH |= {
+    "déc": 12,
+    "ene": 1,
+    "abr": 4,
+    "ago": 8,
+    "dic": 12,
+    "gen": 1,
+    "mag": 5,
+    "giu": 6,
+    "lug": 7,
+    "set": 9,
+    "ott": 10,
+}
+"""First letters of months in English, German, French, Spanish and Italian."""
+ZONES = {"z": 0, "utc": 0, "gmt": 0, "wet": 0, "bst": 1, "cet": 1, "mez": 1, "cest": 2, "mesz": 2, "eet": 2, "eest": 3}
+ZONES |= {"est": -5, "edt": -4, "cst": -6, "cdt": -5, "mst": -7, "mdt": -6, "pst": -8, "pdt": -7, "jst": 9, "kst": 9}
+"""Names of zones, hours from UTC."""
+_WORD = r"[^\W\d_]{3,10}"
+_DATE = {
+    "ymd": r"(?P<y>\d{4})(?P<s>[-/. ]?)(?P<m>\d{1,2})(?P=s)(?P<d>\d{1,2})",
+    "dMy": rf"(?P<d>\d{{1,2}})[-/. ]*(?P<m>{_WORD})[-/., ]*(?P<y>\d{{4}}|\d{{2}})",
+    "Mdy": rf"(?P<m>{_WORD})[-/. ]*(?P<d>\d{{1,2}})[-/., ]+(?P<y>\d{{4}}|\d{{2}})",
+    "yMd": rf"(?P<y>\d{{4}})[-/. ]*(?P<m>{_WORD})[-/. ]*(?P<d>\d{{1,2}})",
+    "dmy": r"(?P<d>\d{1,2})[-/. ](?P<m>\d{1,2})[-/. ](?P<y>\d{4}|\d{2})",
+    "mdy": r"(?P<m>\d{1,2})[-/. ](?P<d>\d{1,2})[-/. ](?P<y>\d{4}|\d{2})",
+}
+_FORMS = {"iso": ("ymd", "dMy", "Mdy", "yMd"), "clock": ()}
+_FORMS |= {unit: (unit, *_FORMS["iso"]) for unit in ("dmy", "mdy")}
+_CLOCK = (
+    r"(?P<H>\d{1,2}):?(?P<M>\d{2})(?::?(?P<S>\d{2})(?:[.,:](?P<f>\d+))?)?\s*(?P<half>[AaPp])?(?(half)\.?[Mm]\.?)"
+    r"\s*(?:(?P<sign>[-+])(?P<zh>\d{2}):?(?P<zm>\d{2})?|(?P<zone>[A-Za-z]{1,4}))?\s*(?:\[[\w/+-]+\])?"
+)
+
+
+def _read_times(text: Any, unit: str) -> tuple[Any, bool]:
+    """Parse times [s], NaN where a field is none; True if they are local times that do not say from where."""
     import pandas
 
     factor, _ = TIME[unit]
-    if unit == "clock":
-        whole = text.str.replace(r"^\d+:\d+$", r"\g<0>:00", regex=True).str.replace(",", ".")
-        only = whole.where(whole.str.match(r"\d+:\d+:\d+(\.\d+)?$"))
-        return pandas.to_timedelta(only, errors="coerce").dt.total_seconds()
     if unit not in DATED:
-        return pandas.to_numeric(_plain_numbers(text), errors="coerce").astype(float) * factor
-    plain = text.where(text.str.contains(r"\d[-./]\d")).str.replace(r",(\d+)$", r".\1", regex=True)
-    how: Any = {"format": "ISO8601"} if unit == "iso" else {"format": "mixed", "dayfirst": unit == "dmy"}
-    times = pandas.to_datetime(plain, utc=True, errors="coerce", **how)
-    return (times - pandas.Timestamp(0, tz="utc")).dt.total_seconds()
+        return pandas.to_numeric(_plain_numbers(text), errors="coerce").astype(float) * factor, False
+    if unit == "clock":
+        parts = text.str.extract(rf"^{_CLOCK.replace(':?', ':')}$")
+        return _seconds(parts), bool(parts[["sign", "zone"]].isna().all(axis=None))
+    plain = text.str.replace(rf"^{_WORD}\.?,? +(?=\d|{_WORD})", _no_weekday, regex=True)
+    plain = plain.str.replace(r"^(\d{4})年(\d{1,2})月(\d{1,2})日", r"\1-\2-\3", regex=True)
+    times, naive = pandas.Series(np.nan, text.index), True
+    for form in _FORMS[unit]:
+        at = times.isna()
+        if not at.any():
+            break
+        parts = plain[at].str.extract(rf"^{_DATE[form]}(?:[T ,]+{_CLOCK})?$")
+        month = pandas.to_numeric(parts["m"], errors="coerce")
+        month = month.fillna(parts["m"].str.lower().str[:3].map(MONTH)).mask(
+            parts["m"].str.lower().isin(["juin", "juni"]), 6.0
+        )
+        year, day = parts["y"].astype(float), parts["d"].astype(float)
+        year = year.where(year >= 100.0, year + np.where(year < 70.0, 2000.0, 1900.0))
+        dates = pandas.to_datetime(pandas.DataFrame({"year": year, "month": month, "day": day}), errors="coerce")
+        days = (dates - pandas.Timestamp(0)).dt.total_seconds()
+        clock = _seconds(parts).where(parts["H"].notna(), 0.0)
+        times[at] = days + clock
+        naive &= bool(parts[["sign", "zone"]].isna().all(axis=None))
+    return times, naive
+
+
+def _no_weekday(match: re.Match[str]) -> str:
+    return match[0] if match[0][:3].lower() in MONTH else ""
+
+
+def _seconds(parts: Any) -> Any:
+    """Seconds since midnight in UTC of the parts of times of day; NaN for one that no clock shows."""
+    hour, minute = (parts[name].astype(float) for name in "HM")
+    second = parts["S"].astype(float).fillna(0.0) + ("0." + parts["f"]).astype(float).fillna(0.0)
+    half = parts["half"].str.lower()
+    wrong = (minute >= 60.0) | (second >= 61.0) | (hour > 24.0) | (half.notna() & ((hour < 1.0) | (hour > 12.0)))
+    hour = hour.where(half.isna(), hour % 12.0 + 12.0 * (half == "p"))
+    named = parts["zone"].str.lower().map(ZONES)
+    wrong |= parts["zone"].notna() & named.isna()
+    away = parts["zh"].astype(float).fillna(0.0) * HOUR + parts["zm"].astype(float).fillna(0.0) * MINUTE
+    away = away * np.where(parts["sign"] == "-", -1.0, 1.0) + named.astype(float).fillna(0.0) * HOUR
+    return (HOUR * hour + MINUTE * minute + second - away).mask(wrong)
 
 
 def _plain_numbers(text: Any) -> Any:
@@ -148,21 +330,77 @@ def _plain_numbers(text: Any) -> Any:
     both = both[both[0] != both[1]].dropna()
     if len(both):
         text = text.str.replace(both[0].iloc[0], "", regex=False)
-    return text.str.replace(",", ".", regex=False).replace({"True": "1", "False": "0"})
+    return text.str.replace(",", ".", regex=False)
 
 
-def parse_numbers(column: Any, line: int) -> Any:
-    """Parse a column's numbers; an absent one is NaN. CzError names the row of a field that is none."""
+def parse_numbers(column: Any, name: str, notes: dict[str, int]) -> Any:
+    """Parse a column's numbers; an absent one, or a word in its place, is NaN. CzError names the row of another field
+    that is none.
+    """
     import pandas
 
     text = column.fillna("").str.strip()
     absent = text.str.lower().isin(ABSENT)
     numbers = pandas.to_numeric(_plain_numbers(text).mask(absent), errors="coerce").astype(float)
     wrong = numbers.isna() & ~absent
+    words = wrong & ~text.str.match(r"[-+]?[.,]?\d") & ~text.str.lower().isin(MEANT)
+    if words.sum() <= WORDS * (~absent).sum():
+        said = ", ".join(repr(str(word)) for word in dict.fromkeys(text[words]))
+        notes[f"fields of {name} are words and count as missing: {said:.80}"] = int(words.sum())
+        wrong &= ~words
     if wrong.any():
         row = wrong.idxmax()
-        raise CzError(f"row {row + line}: {column.name} = {text[row]!r} is no number")
+        raise CzError(f"row {row}: {column.name} = {text[row]!r} is no number")
     return numbers
+
+
+def parse_quality(column: Any) -> Any:
+    """Parse qualities: 1 where a reading is good, 0 where it is not; NaN where nothing is said.
+
+    Words, 1 and 0, percents, codes of OPC (192 and above is good) and of OPC UA (0 is good, from 2^30 on none is).
+    CzError names a row.
+    """
+    import pandas
+
+    text = column.fillna("").str.strip()
+    low = text.str.lower().str.extract(r"^([^\W\d_]+)")[0]
+    numbers = pandas.to_numeric(_plain_numbers(text), errors="coerce").astype(float)
+    codes, largest = numbers.to_numpy(), float(numbers.fillna(0.0).max())
+    if largest >= 2**30:
+        good = codes < 2**30
+    elif largest in (1.0, 100.0) or largest < 1.0:
+        good = codes >= max(largest, 1.0) / 2.0
+    else:
+        good = codes >= 192.0
+    quality = pandas.Series(np.where(np.isnan(codes), np.nan, good), text.index)
+    quality = quality.mask(low.isin(GOOD), 1.0).mask(low.isin(BAD), 0.0)
+    wrong = quality.isna() & ~text.str.lower().isin(ABSENT)
+    if wrong.any():
+        row = wrong.idxmax()
+        raise CzError(f"row {row}: {column.name} = {text[row]!r} is no quality: 1 or 0, Good or Bad, an OPC code")
+    return quality
+
+
+def name_compression(table: Any, notes: dict[str, int]) -> None:
+    """Note columns whose blanks fit "unchanged", and those whose changes are as behind a dead band."""
+    for name in OUTLIERS:
+        values = table[name].to_numpy()
+        read = values[np.isfinite(values)]
+        changes = np.abs(np.diff(read))
+        if len(read) < FEW_CHANGES or not changes.any():
+            continue
+        blank, rest = 1.0 - len(read) / len(values), float(np.mean(changes == 0.0))
+        own, (size, _) = next(iter(COLUMNS[name].items()))
+        if blank >= BLANK and rest < 0.01:
+            lost = len(values) - len(read)
+            notes[f"fields of {name} are blank, and all fit 'unchanged': --hold holds the last value"] = lost
+        least = float(np.quantile(changes[changes > 0.0], 0.02))
+        finest = float(np.diff(np.unique(read)).min())
+        if (changes > 0.0).sum() >= FEW_CHANGES and blank + rest >= BLANK and least > 4.0 * finest:
+            notes[
+                f"changes of {name} are all of {least / size:.2g} {own} or more, as behind the dead band of a "
+                "historian's compression: export raw values"
+            ] = int((changes > 0.0).sum())
 
 
 # Rows at equal times, without outliers; notes of what was left out or filled.
@@ -185,6 +423,10 @@ least deviation that counts, in the column's SI unit and as a share of its media
 half of its neighbours have made it."""
 THIN = 11.0
 """Longest time between the rows that are estimated from, where the log's own are closer [s]."""
+BLANK, FEW_CHANGES = 0.2, 30
+"""Share of blank or unchanged fields, and number of changes, from which on a column may be compressed."""
+CLOCK_OFF = 2.0
+"""Least difference of the camera's clock and the rows' that is named [s]."""
 ABSURD = 2.0
 """Readings of ring and pyrometer that differ from their median by more than this factor are outliers too."""
 
@@ -218,7 +460,7 @@ class Log(NamedTuple):
     """Number of the sensors' readings that a row's are the means of."""
 
 
-def sound_rows(table: Any, line: int, notes: dict[str, int]) -> Any:
+def sound_rows(table: Any, unit: str, notes: dict[str, int]) -> Any:
     """Select the rows from the first one with both drives on, one a time; CzError for times that go back, and for too
     short a log.
     """
@@ -226,7 +468,10 @@ def sound_rows(table: Any, line: int, notes: dict[str, int]) -> Any:
     back = np.diff(time) < 0.0
     if back.any():
         row = int(np.argmax(back)) + 1
-        raise CzError(f"row {row + line}: time goes back by {time[row - 1] - time[row]:g} s; sort the rows by time")
+        raise CzError(
+            f"row {table.index[row]}: time goes back by {time[row - 1] - time[row]:g} s; sort the rows by time"
+        )
+    _check_interval(time, unit)
     begun = table[list(DRIVES)].notna().cummax().all(axis=1)
     for name in DRIVES:
         if not table[name].notna().any():
@@ -244,6 +489,29 @@ def sound_rows(table: Any, line: int, notes: dict[str, int]) -> Any:
     return table
 
 
+def _interval(time: Floats) -> float:
+    """Usual time between rows [s]."""
+    steps = np.diff(time)
+    steps = steps[steps > 0.0]
+    return float(steps[np.abs(steps / np.median(steps) - 1.0) <= 0.5].mean()) if len(steps) else 1.0
+
+
+def _check_interval(time: Floats, unit: str) -> None:
+    """Raise CzError for rows too close or too far apart, with the unit that may be meant: one of an epoch, of a
+    spreadsheet's days, or the first in which the rows are as far apart as a log's.
+    """
+    interval = _interval(time)
+    if INTERVALS[0] <= interval <= INTERVALS[1]:
+        return
+    now = TIME[unit][0]
+    sizes = {each: size / now for each, (size, _) in TIME.items() if each not in DATED}
+    meant = [each for each, size in sizes.items() if INTERVALS[0] <= interval * size <= INTERVALS[1]]
+    dated = [each for each in meant if 9e8 <= time[0] * sizes[each] <= 4.2e9]
+    meant = [each for each in meant if each in dated or (each == "d" and time[0] * sizes[each] > 2e9)] or meant
+    hint = f": did you mean time_s=COLUMN:{meant[0]}?" if meant and unit not in DATED else ""
+    raise CzError(f"the rows are {interval:.4g} s apart{hint}")
+
+
 def _slots(time: Floats, interval: float) -> npt.NDArray[np.int64]:
     """Find the row of the grid that each time belongs to; the grid follows the times slowly: jitter does not matter."""
     phases = np.exp(2j * np.pi * (time[:50] - time[0]) / interval)
@@ -255,15 +523,13 @@ def _slots(time: Floats, interval: float) -> npt.NDArray[np.int64]:
     return slots
 
 
-def on_grid(table: Any, notes: dict[str, int]) -> Log:
-    """Put the table's rows at equal times; add to the notes what was left out or filled."""
+def on_grid(table: Any, notes: dict[str, int], hold: bool = False) -> Log:
+    """Put the table's rows at equal times; add to the notes what was left out or filled.
+
+    With ``hold``, drives keep their last value in rows that there are not.
+    """
     time = table["time_s"].to_numpy()
-    steps = np.diff(time)
-    interval = float(steps[np.abs(steps / np.median(steps) - 1.0) <= 0.5].mean())
-    if not INTERVALS[0] <= interval <= INTERVALS[1]:
-        meant = [unit for unit in TIME if unit not in DATED and 0.2 <= interval * TIME[unit][0] <= 60.0]
-        hint = f": did you mean time_s=COLUMN:{meant[0]}?" if meant else ""
-        raise CzError(f"the rows are {interval:.4g} s apart{hint}")
+    interval = _interval(time)
     index = _slots(time, interval)
     if index[-1] > 50 * len(time):
         raise CzError("nearly all of it are gaps: are its times in another unit?")
@@ -274,6 +540,8 @@ def on_grid(table: Any, notes: dict[str, int]) -> Log:
     notes["rows are missing"] = n - len(present)
     grid = table[last].set_axis(present).reindex(range(n))
     _drop_bad_readings(grid, present, notes)
+    if hold:
+        grid[list(DRIVES)] = grid[list(DRIVES)].ffill()
     after_gap = present[1:][np.diff(present) * interval > LONG_GAP]
     notes[f"gaps are longer than {LONG_GAP:g} s"] = len(after_gap)
     filled = grid[list(DRIVES)].interpolate(limit_direction="both")
@@ -282,7 +550,7 @@ def on_grid(table: Any, notes: dict[str, int]) -> Log:
     parts = (grid[REQUIRED[1]], *(filled[name] for name in DRIVES), grid["T_1_K"], held["r_ref_mm"], held["T_1_ref_K"])
     readings: list[Any] = [np.array(part, np.float64) for part in parts]
     gap = np.isin(np.arange(n), after_gap)
-    said = tuple(f"{count} {what}" for what, count in notes.items() if count)
+    said = tuple(what if count is True else f"{count} {what}" for what, count in notes.items() if count)
     return Log._make([interval * np.arange(n, dtype=np.float64), *readings, gap, unsure, interval, said, 1])
 
 
@@ -297,7 +565,8 @@ def _drop_bad_readings(grid: Any, present: npt.NDArray[np.int64], notes: dict[st
         grid[name] = grid[name].mask(outlier)
         notes[f"readings of {name} are missing"] = int(grid[name][present].isna().sum() - outlier.sum())
         if grid[name].count() < 0.3 * len(grid):
-            raise CzError(f"{name} has only {grid[name].count()} good readings in {len(grid)} rows")
+            hint = "; if blank means unchanged, say --hold" if grid[name].count() else ""
+            raise CzError(f"{name} has only {grid[name].count()} good readings in {len(grid)} rows{hint}")
         if name not in DRIVES and grid[name].min() == grid[name].max():
             raise CzError(f"{name} is constant, so it tells nothing")
     notes["readings of ring_radius_mm are missing"] -= notes["readings of the ring are not valid"]
@@ -392,20 +661,27 @@ def column_map(given: Sequence[str], file: Path | None = None) -> dict[str, tupl
     return columns
 
 
-def read_log(path: str | Path, columns: Mapping[str, tuple[str, str]] | None = None) -> Log:
+def read_log(
+    path: str | Path,
+    columns: Mapping[str, tuple[str, str]] | None = None,
+    hold: bool = False,
+    where: Sequence[str] = (),
+) -> Log:
     """Read a CSV or Parquet file; CzError names the row and what is wrong with it.
 
     ``columns`` gives column and unit of standard names that the file calls otherwise (:func:`column_map`); the time may
-    stand in two columns, ``DATE+CLOCK``. Lines before the names of the columns, and below them those without a time,
-    are left out. Repeated times count once, with their last row. Readings that are absent, infinite, not valid or
-    outliers become NaN, and drives are interpolated.
+    stand in two columns, ``DATE+CLOCK``, or be a Parquet file's index. ``where`` selects rows by COLUMN=VALUE. With
+    ``hold`` a blank field means that its value has not changed. Lines before the names of the columns, and below them
+    those without a time, are left out. Repeated times count once, with their last row. Readings that are absent,
+    infinite, not valid or outliers become NaN, and drives are interpolated.
     """
     import pandas
 
     named = {name: (name, next(iter(units))) for name, units in COLUMNS.items()} | dict(columns or {})
     try:
+        notes = dict[str, int]()
         with name_file_in_errors(path):
-            file, line = read_fields(Path(path), {column for column, _ in named.values()})
+            file = read_fields(Path(path), {column for column, _ in named.values()}, notes)
         if (time := named["time_s"][0]) not in file and set(parts := time.split("+")) <= set(file):
             file[time] = file[parts].fillna("").agg(" ".join, axis=1)
         for name in (*REQUIRED, *(columns or {})):
@@ -415,20 +691,55 @@ def read_log(path: str | Path, columns: Mapping[str, tuple[str, str]] | None = N
                     f"{unknown_name_message('column', column, file)}; {name}=COLUMN:{own} says which one it is"
                 )
         present = {name: (column, unit) for name, (column, unit) in named.items() if column in file}
-        for column, _ in present.values():
-            if isinstance(file[column], pandas.DataFrame):
+        for column in (
+            *(column for column, _ in present.values()),
+            *(each.partition("=")[0].strip() for each in where),
+        ):
+            if column in file and isinstance(file[column], pandas.DataFrame):
                 raise CzError(f"two columns are called {column!r}: give one of them another name")
-        notes, unit = dict[str, int](), present["time_s"][1]
-        seconds, first = parse_times(file[time], unit, line, notes)
+        file, (_, unit) = select_rows(file, where), present["time_s"]
+        seconds = parse_times(file[time], unit, notes)
         table = pandas.DataFrame(index=seconds.index, columns=list(COLUMNS), dtype=float).assign(time_s=seconds)
-        for name, (column, unit) in list(present.items())[1:]:
-            factor, added = COLUMNS[name][unit]
-            table[name] = parse_numbers(file[column][seconds.index], line) * factor + added
-        infinite = np.isinf(table.to_numpy()).sum()
-        notes["numbers are infinite"] = int(infinite)
-        return on_grid(sound_rows(table.replace([np.inf, -np.inf], np.nan), line + first, notes), notes)
+        for name, (column, own) in list(present.items())[1:]:
+            field, (factor, added) = file[column][seconds.index], COLUMNS[name][own]
+            if name == "valid":
+                table[name] = parse_quality(field)
+            elif name == "frame_time_s":
+                table[name] = _read_times(field.fillna("").str.strip(), own)[0]
+            else:
+                table[name] = parse_numbers(field, name, notes) * factor + added
+        notes["numbers are infinite"] = int(np.isinf(table.to_numpy()).sum())
+        table = table.replace([np.inf, -np.inf], np.nan)
+        _name_camera_clock(table, notes)
+        name_compression(table, notes)
+        if hold:
+            table = table.ffill()
+        return on_grid(sound_rows(table, unit, notes), notes, hold)
     except CzError as error:
         raise CzError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
+
+
+def _name_camera_clock(table: Any, notes: dict[str, int]) -> None:
+    """Note by how much the camera's clock is ahead of the rows' or behind."""
+    late = (table["time_s"] - table["frame_time_s"]).median()
+    if abs(late) >= CLOCK_OFF:
+        told = "" if late < 0.0 else ", or its frames are that old (latency_s of the puller file)"
+        notes[f"the camera's clock is {abs(late):.3g} s {'ahead' if late < 0.0 else 'behind'}{told}"] = True
+
+
+def add_log_options(parser: Any) -> None:
+    """Add the options that say how a log is read to a command's parser; :func:`read_given` follows them."""
+    add, named = parser.add_argument, "NAME=COLUMN[:UNIT]"
+    add("--column", action="append", default=[], metavar=named, help="a log's column with another name or unit")
+    add("--columns", type=Path, metavar="FILE", help='TOML file with lines NAME = "COLUMN:UNIT"')
+    add("--hold", action="store_true", help="a blank field of the log means that its value has not changed")
+    about = "read only the log's rows with this value, for instance OPERATION=BODY; several columns: rows with all"
+    add("--where", action="append", default=[], metavar="COLUMN=VALUE", help=about)
+
+
+def read_given(path: Path, given: Any) -> Log:
+    """Read a log as a command's options say (:func:`add_log_options`)."""
+    return read_log(path, column_map(given.column, given.columns), given.hold, given.where)
 
 
 def check_puller(log: Log, machine: PullerFile, source: str = "the log") -> None:
@@ -455,7 +766,8 @@ def check_puller(log: Log, machine: PullerFile, source: str = "the log") -> None
     if off.sum() > CONE * np.isfinite(log.ring).sum():
         raise CzError(
             f"{source}: in {off.sum()} of {off.size} rows the ring is more than {BODY * puller.r_0 / MM:.0f} mm from "
-            f"the body's: identification fits the body alone, so cut crown and tail off"
+            f"the body's: identification fits the body alone, so cut crown and tail off, or select the body's rows: "
+            "--where COLUMN=VALUE"
         )
 
 
@@ -479,7 +791,7 @@ def record_log(env: Any, policy: Any, path: str | Path, seed: int | None = None)
         action, state = policy.predict(observation, state, np.array([state is None]), deterministic=True)
         observation, _, terminated, truncated, info = env.step(np.asarray(action))
         over = terminated or truncated
-    table, path = pandas.DataFrame(rows, columns=list(COLUMNS)), Path(path)
+    table, path = pandas.DataFrame(rows, columns=list(RECORDED)), Path(path)
     parquet = path.suffix == ".parquet"
     text = table.to_parquet(index=False) if parquet else table.to_csv(index=False, float_format="%.10g").encode()
     write_files({path: text})

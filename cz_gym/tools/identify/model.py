@@ -62,6 +62,8 @@ class Lags(NamedTuple):
     """Time constant of the pyrometer's filter [s]."""
 
 
+RING_GAIN = "ring_gain"
+"""Factor on the ring-to-height gain; a free number only where a log is judged."""
 LAM = MIX
 """Share of conduction where it is not free, and the mean of its prior [-]."""
 TAU_FAST, TAU_SLOW, TAU_RATE = 30.0, 780.0, 2400.0
@@ -97,8 +99,8 @@ def build_filter(meniscus: MeniscusModel) -> Any:
 
     def run(
         p: Any, A: Any, Q: Any, z: Any, start: Any, R: Any, read: Any, drives: Any, unsure: Any, gap: Any, slow: Any,
-        dt: Any, parts: Any, lowest: Any, highest: Any, error: Any, variance: Any, states: Any, expected: Any,
-        covariance: Any,
+        gain: Any, dt: Any, parts: Any, lowest: Any, highest: Any, error: Any, variance: Any, states: Any,
+        expected: Any, covariance: Any,
     ) -> None:  # fmt: skip
         P, A_t = start, np.ascontiguousarray(A.T)
         for k in range(read.shape[0]):
@@ -124,9 +126,10 @@ def build_filter(meniscus: MeniscusModel) -> Any:
                     H[11], H[9], reads = 1.0, 1.0, z[11] + z[9]
                 else:
                     near, far = _SHARE * z[0], _SHARE * z[1]
-                    H[0] = 1.0 + (ring_offset(z[0] + near, z[1], p) - ring_offset(z[0] - near, z[1], p)) / (2.0 * near)
-                    H[1] = (ring_offset(z[0], z[1] + far, p) - ring_offset(z[0], z[1] - far, p)) / (2.0 * far)
-                    H[10], reads = 1.0, z[0] + ring_offset(z[0], z[1], p) + z[10]
+                    wider = ring_offset(z[0] + near, z[1], p) - ring_offset(z[0] - near, z[1], p)
+                    higher = ring_offset(z[0], z[1] + far, p) - ring_offset(z[0], z[1] - far, p)
+                    H[0], H[1], H[10] = 1.0 + gain * wider / (2.0 * near), gain * higher / (2.0 * far), 1.0
+                    reads = z[0] + p.ring_bias + gain * (ring_offset(z[0], z[1], p) - p.ring_bias) + z[10]
                 PH = P @ H
                 error[k, sensor], variance[k, sensor] = read[k, sensor] - reads, (H * PH).sum() + R[sensor]
                 z = z + PH * (error[k, sensor] / variance[k, sensor])
@@ -210,7 +213,8 @@ def predict(log: Log, model: Model, theta: Any) -> Predicted:
     R = np.array([noise.pyrometer_sd**2, noise.camera_sd**2], np.complex128) / log.mean_of + np.square(FLOOR)
     read, drives = np.stack([log.T_1, log.ring], axis=1), np.stack([log.v_p, heating(log, delays)], axis=1)
     limits = HEIGHT_MIN, HEIGHT_MAX_IN_A * float(p.a.real)
-    steps = log.unsure, log.gap, slow, log.interval, parts
+    gain = np.complex128(np.exp(dict(zip(model.names, theta, strict=True)).get(RING_GAIN, 0.0)))
+    steps = log.unsure, log.gap, slow, gain, log.interval, parts
     build_filter(meniscus)(p, A, Q, z, P, R, read, drives, *steps, *limits, *out)
     return out
 

@@ -33,6 +33,9 @@ SHARE = 0.2
 """Share of a drive's usual move in a window that must be unexplained; less is what the law is not exact for [-]."""
 FEW = 0.1
 """Share of the windows that do not count: those with the largest moves, which a reading may explain that is lost."""
+STEP, LASTS, LARGER, SEVERAL = 0.015, 0.7, 3.0, 3
+"""Among those, steps of a step test count: from this share of nominal on, of which the windows beside them leave that
+share, and larger than the other windows' moves by that factor, if there are several. A controller takes a kick back."""
 PAST, MEANS = 6, (20.0, 60.0, 200.0, 600.0)
 """Last values of drive and readings that explain a move, and time constants of means that do, too [s]."""
 ROUNDS, EDGE = 30, 0.05
@@ -108,10 +111,22 @@ def _unexplained(drive: Floats, readings: Floats, log: Log) -> Floats:
     free = drive[last] - law.run(asked[windows], own[first, :PAST], own[first, PAST:])
     single = (moves - np.clip(asked + own @ law.own, *law.move_limits(own[:, 0])))[windows].sum(axis=1)
     usual = drive[last] - drive[rows[first] - 1]
-    *ways, usual = (np.sort(np.abs(each))[: int((1.0 - FEW) * len(each))] for each in (free, single, usual))
-    left = max(ways, key=np.linalg.norm)
-    moved: Floats = np.sqrt(count / len(windows)) * left[left > MOVE]  # those left out moved as much
-    return moved if np.linalg.norm(left) > SHARE * np.linalg.norm(usual) else np.zeros(0)
+    usual = np.sort(np.abs(usual))[: int((1.0 - FEW) * len(usual))]
+    left, steps = max(map(_counted, (free, single)), key=lambda each: float(np.linalg.norm(np.concatenate(each))))
+    more = np.sqrt(count / len(windows))  # those left out moved as much
+    known = np.linalg.norm(left) <= SHARE * np.linalg.norm(usual)
+    moved: Floats = more * np.concatenate([left[(left > MOVE) & ~known], steps])
+    return moved
+
+
+def _counted(moves: Floats) -> tuple[Floats, Floats]:
+    """Sizes of the moves of all windows but FEW with the largest ones, and of those the steps that last."""
+    sizes, around = np.abs(moves), np.abs(np.convolve(moves, np.ones(3), "same"))
+    order, few = np.argsort(sizes), int((1.0 - FEW) * len(moves))
+    rest, largest = sizes[order[:few]], order[few:]
+    least = max(STEP, LARGER * rest.max(initial=0.0))
+    steps = sizes[largest][(sizes[largest] >= least) & (around[largest] >= LASTS * sizes[largest])]
+    return rest, steps if len(steps) >= SEVERAL else steps[:0]
 
 
 def _past(values: Floats, keep: Floats, rows: npt.NDArray[np.int64]) -> Floats:

@@ -1,11 +1,13 @@
 """The command: a puller file, a report and pictures; or one line and nothing. The study, on three pullers."""
 
+import re
 from dataclasses import replace
 
 import pytest
 
 from cz_gym.puller.file import find_puller, read_puller, write_puller
 from cz_gym.tools.identify import command
+from cz_gym.tools.identify.file import puller_text
 from examples import identify as example
 from studies import identify as study
 
@@ -22,6 +24,39 @@ def test_the_command_writes_the_puller_and_its_report(logs, found, tmp_path, mon
     assert "says nothing about it" in text
     assert "calliper" in text
     assert text.startswith("# The model fits the log")
+
+
+START = """# Line 3, hall B
+format = 1
+name = "line 3"
+[crystal]
+radius_mm = 87.5 # drawing 4711
+[hot_zone]
+C_1_J_per_K = 57000 # graphite, 30 kg
+G_2b_W_per_K = 200
+"""
+
+
+def test_the_file_keeps_what_was_known_and_says_where_each_number_is_from(found, tmp_path):
+    (tmp_path / "start.toml").write_text(START)
+    start = read_puller(tmp_path / "start.toml")
+    text = puller_text(replace(found, start=start), "log.csv", "my")
+    (tmp_path / "my.toml").write_text(text)
+    mine = read_puller(tmp_path / "my.toml")
+    assert (mine.name, mine.hash) == ("line 3", found.puller.hash)
+    assert {"T_a_K", "sigma_N_per_m"} <= set(mine.missing), "a default is no fact"
+    for line in (
+        "# Line 3, hall B", "radius_mm = 87.5 # drawing 4711",
+        "# identify: T_a_K = 350 (default, nobody has said it)",
+        "# identify: sigma_N_per_m = 0.72 (default, nobody has said it; prior, standard deviation 5 % (handbooks of",
+    ):  # fmt: skip
+        assert f"\n{line}" in f"\n{text}"
+    assert re.search(
+        r"C_1_J_per_K = [\d.]+ # graphite, 30 kg; identify: estimated, 95 % interval .* start 5.7e\+04\n", text
+    )
+    assert re.search(r"\[melt\]\nfluctuation_sd_K = \[.*\] # identify: estimated, 95 % intervals: fast .*, slow", text)
+    again = puller_text(replace(found, start=mine), "log.csv", "my")
+    assert again.count("graphite, 30 kg; identify: ") == 1
 
 
 def test_a_model_that_does_not_fit_is_no_result(logs, found, tmp_path, monkeypatch, capsys):

@@ -98,6 +98,15 @@ def test_steps_of_a_heater_that_no_controller_moves_count(tmp_path):
     assert min(measure_excitation([read_log(tmp_path / "log.csv")])) > 5.0
 
 
+@pytest.mark.parametrize("size", [0.015, 0.03])
+def test_a_step_test_counts(size, tmp_path):
+    """Steps of 3 and 6 % beside a controller, a few in three hours; of 2 % it takes a dozen at the pull."""
+    env = CzEnv(OWN, 0.5, "measured", parameters=TRUTH, action="direct", info="all")
+    pid = make_controller("pid-conventional", env.config)
+    record_log(env, Excited(pid, size, size, clock=600.0, limit=5.0 * MM), tmp_path / "log.csv", seed=3)
+    assert min(measure_excitation([read_log(tmp_path / "log.csv")])) >= 1.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper-tuned", "lqg-at-0.02", "pid-conventional"])
 def test_controllers_alone_excite_nothing_whatever_their_law(name, tmp_path):
@@ -154,6 +163,26 @@ def test_coloured_errors_that_no_camera_would_show_are_no_misfit(found):
         doubted = replace(found, errors=errors, predicted=found.predicted._replace(error=error))
         puller = make_puller(found.puller.parameters)
         assert sum("ring are coloured" in each for each in misfits(doubted, puller, {})) == said
+
+
+def test_a_ring_that_is_not_the_file_s_is_a_misfit(found):
+    """The file's ring stands elsewhere, or moves otherwise with the meniscus, than the log's."""
+    puller = make_puller(found.puller.parameters)
+    assert not [each for each in misfits(found, puller, {}) if "ring" in each]
+    (said,) = misfits(found, make_puller(found.puller.parameters._replace(sigma=1.09)), {})
+    assert said.startswith("its ring is 17.3 mm outside the crystal where the log's is 14.4 mm outside the reference")
+    (said,) = misfits(replace(found, ring_gain=(1.6, 0.1)), puller, {})
+    assert said == "the log's ring moves 1.6 times as much with the meniscus' height as the file's"
+    assert abs(np.log(found.ring_gain[0])) < 2.0 * found.ring_gain[1] < 1.0
+
+
+def test_material_constants_have_the_priors_of_handbooks(found):
+    assert {name: found.sds[name] for name in ("sigma", "k_l", "rho_l", "alpha_0", "C_1")} == {
+        "sigma": 0.05, "k_l": 0.1, "rho_l": 0.01, "alpha_0": 0.1, "C_1": 0.35,
+    }  # fmt: skip
+    sigma = next(e for e in found.estimates if e.name == "sigma")
+    assert sigma.high / sigma.low < np.exp(2.0 * 1.97 * 0.05)
+    assert found.puller.fluctuation_sd is not None
 
 
 def test_a_log_of_a_controller_alone_tells_nothing(logs):

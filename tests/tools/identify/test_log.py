@@ -113,6 +113,18 @@ def test_gaps_repeats_jitter_and_outliers_are_counted(logs, rows, tmp_path):
         (every("valid", "0"), "ring_radius_mm has only 0 good readings in 2161 rows"),
         (lambda rows: rows.rename(columns={"T_1_K": "T1"}), "column 'T_1_K'"),
         (changed("time_s", "1e9", 2160), "nearly all of it are gaps"),
+        (lambda rows: stamped(rows, "%m/%d/%Y %H:%M:%S", "2026-03-11T23:00:00"), "did you mean time_s=time_s:mdy?"),
+        (lambda rows: stamped(rows, "%d-%b-%y %H:%M:%S"), "did you mean time_s=time_s:iso"),
+        (every("time_s", lambda time: f"{46082.5 + float(time) / 86400:.8f}"), "did you mean time_s=COLUMN:d?"),
+        (every("time_s", lambda time: f"{int((1.7e9 + float(time)) * 1e9)}"), "did you mean time_s=COLUMN:ns?"),
+        (every("time_s", lambda time: f"{int((1.7e9 + float(time)) * 1e6)}"), "did you mean time_s=COLUMN:us?"),
+        (changed("T_1_K", "1785.2 K"), "row 402: T_1_K = '1785.2 K' is no number"),
+        (every("T_1_K", "Bad Input"), "row 2: T_1_K = 'Bad Input' is no number"),
+        (changed("valid", "maybe"), "row 402: valid = 'maybe' is no quality"),
+        (
+            lambda rows: rows.assign(T_1_K=rows.T_1_K.where(rows.index % 5 == 0, "")),
+            "if blank means unchanged, say --hold",
+        ),
     ],
 )
 def test_what_is_wrong_is_one_line_with_its_row(change, said, rows, tmp_path):
@@ -142,6 +154,35 @@ def two_columns(rows):
     return rows.drop(columns="time_s").assign(Date=time[:10], Time=time[11:])
 
 
+def spring(rows):
+    parts = (rows[:1080], "00:30:00"), (rows[1080:], "01:30:00")
+    return pandas.concat([stamped(part, "%F %T", f"2026-03-29T{at}") for part, at in parts])
+
+
+def serials(rows):
+    return rows.assign(time_s=[f"{46082.5 + float(time) / 86400:.9f}" for time in rows.time_s])
+
+
+def epochs(per):
+    return every("time_s", lambda time: str((1_700_000_000 + int(time)) * per))
+
+
+def noted(mark):
+    return lambda rows: rows.assign(note=[f"charge{mark}done" if k == 50 else "" for k in rows.index])
+
+
+def graded(good, bad):
+    """Qualities in words or codes; the bad ones are those of every 50th row."""
+    return lambda rows: rows.assign(valid=[bad if k % 50 == 7 else good for k in rows.index])
+
+
+def phases(rows):
+    """Rows of a neck before those of the body, as a production log has them."""
+    neck = rows[:100].assign(ring_radius_mm="70", OPERATION="NECK", INGOT="7")
+    neck["time_s"] = [f"{float(time) - 3600.0}" for time in neck.time_s]
+    return pandas.concat([neck, rows.assign(OPERATION="BODY", INGOT="7")])
+
+
 def spiked(name, value):
     return lambda rows: pandas.concat([rows[rows.index % 400 != 200], every(name, value)(rows[200::400])]).sort_index()
 
@@ -158,6 +199,27 @@ FORMATS = {
     "tabs and decimal comma": (german,),
     "thousands and decimal comma": (thousands,),
     "inches and degF": (inches, "ring_radius_mm=ring_radius_mm:in", "T_1_K=T_1_K:degF"),
+    "beginning of summer time (opennem #622)": (spring, "time_s=time_s:iso"),
+    "months by name (buckets #702)": (lambda rows: stamped(rows, "%d-%b-%y %H:%M:%S"), "time_s=time_s:dmy"),
+    "months by name, with the year first": (lambda rows: stamped(rows, "%Y-%b-%d %H:%M:%S.000"), "time_s=time_s:iso"),
+    "months by German name": (
+        lambda rows: every("time_s", lambda time: time.replace("May", "Mai"))(
+            stamped(rows, "%d. %b %Y %H:%M:%S", "2026-05-31T23:00:00")), "time_s=time_s:dmy",
+    ),
+    "a weekday, month first": (lambda rows: stamped(rows, "%a %b %d, %Y %I:%M:%S %p"), "time_s=time_s:iso"),
+    "compact times": (lambda rows: stamped(rows, "%Y%m%dT%H%M%S"), "time_s=time_s:iso"),
+    "a zone by name (delorean #101)": (
+        lambda rows: stamped(rows, "%Y-%m-%dT%H:%M:%S+01:00[Europe/Berlin]"), "time_s=time_s:iso",
+    ),
+    "AM and PM": (lambda rows: stamped(rows, "%I:%M:%S %p", "2026-03-01T11:00:00"), "time_s=time_s:clock"),
+    "AM and PM behind a date": (lambda rows: stamped(rows, "%m/%d/%Y %I:%M:%S %p"), "time_s=time_s:mdy"),
+    "days of a spreadsheet (duckle #104)": (serials, "time_s=time_s:d"),
+    "nanoseconds since 1970": (epochs(10**9), "time_s=time_s:ns"),
+    "microseconds since 1970": (epochs(10**6), "time_s=time_s:us"),
+    "a next line inside a field": (noted("\x85"),),
+    "a line separator inside a field (gluonts PR 920)": (noted("\u2028"),),
+    "a form feed inside a field": (noted("\x0c"),),
+    "a line feed inside quotes": (noted("\n"),),
     "inf in a column (cta-lstchain PR 429)": (spiked("T_1_K", "-inf"),),
     "a pyrometer row 30 K off": (spiked("T_1_K", lambda T_1: f"{float(T_1) + 30.0}"),),
     "pyrometer rows at -9999": (spiked("T_1_K", "-9999"),),
@@ -177,10 +239,104 @@ def test_every_kind_of_table_is_the_same_log(kind, logs, rows, tmp_path):
     good = np.isfinite(other.T_1) & (other.unsure == 0.0).all(axis=1)
     spikes = 5 if "row" in kind or "inf" in kind else 0
     assert (good.sum(), len(good)) == (2161 - spikes, 2161)
-    assert len(other.notes) == (2 if "inf" in kind else 1 if spikes or "summer" in kind else 0)
+    assert len(other.notes) == (2 if "inf" in kind else 1 if spikes or "summer" in kind else 0), other.notes
     for name in ("time", "ring", "v_p", "Q_H", "T_1"):
         ours, theirs = (getattr(log, name)[good] for log in (mine, other))
         np.testing.assert_allclose(theirs, ours, rtol=1e-6, atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("good", "bad"),
+    [("1", "0"), ("1.0", "0.0"), ("TRUE", "FALSE"), ("true", "false"), ("Good", "Bad"), ("192", "0"), ("216", "24"),
+     ("0", "2147483648"), ("100", "0"), ("Good [Local Override]", "Uncertain"), ("OK", "")],
+)  # fmt: skip
+def test_qualities_of_any_historian_leave_out_the_same_readings(good, bad, rows, tmp_path):
+    log = read_log(write(tmp_path / "log.csv", graded(good, bad)(rows)))
+    assert np.flatnonzero(np.isnan(log.ring)).tolist() == (list(range(7, 2161, 50)) if bad else [])
+
+
+def test_words_among_numbers_are_missing_and_counted(rows, tmp_path):
+    rows = rows.assign(T_1_K=rows.T_1_K.mask(rows.index.isin([100, 101, 102]), "Bad Input"))
+    log = read_log(write(tmp_path / "log.csv", changed("heater_power_kW", "I/O Timeout", 200)(rows)))
+    assert np.flatnonzero(np.isnan(log.T_1)).tolist() == [100, 101, 102]
+    assert np.flatnonzero(log.unsure[:, 1]).tolist() == [200]
+    assert "3 fields of T_1_K are words and count as missing: 'Bad Input'" in log.notes
+    assert "1 fields of heater_power_kW are words and count as missing: 'I/O Timeout'" in log.notes
+
+
+def test_nul_bytes_of_a_power_failure_cost_their_rows_alone(logs, tmp_path):
+    lines, mine = logs[0].read_bytes().split(b"\n"), read_log(logs[0])
+    (tmp_path / "log.csv").write_bytes(logs[0].read_bytes() + b"\0" * 512)
+    assert read_log(tmp_path / "log.csv").notes == ()
+    lines[400] = lines[400][:20] + b"\0" * 40
+    lines[900] = lines[899][:9] + b"\0" * 40 + lines[900]
+    (tmp_path / "log.csv").write_bytes(b"\n".join(lines))
+    log = read_log(tmp_path / "log.csv")
+    assert log.notes[0] == "1 rows are lost in NUL bytes, as after a power failure"
+    assert np.flatnonzero(np.isnan(log.T_1)).tolist() == [399]
+    np.testing.assert_array_equal(log.T_1[400:], mine.T_1[400:])
+    lines[1000] = lines[1000].replace(b",", b",0_", 1)
+    (tmp_path / "log.csv").write_bytes(b"\n".join(lines))
+    with pytest.raises(CzError, match=r"row 1001: ring_radius_mm = '0_"):
+        read_log(tmp_path / "log.csv")
+
+
+def test_the_index_of_a_parquet_file_is_its_time(logs, tmp_path):
+    table, mine = pandas.read_csv(logs[0]), read_log(logs[0])
+    stamps = pandas.Timestamp("2026-03-01 12:00:05") + pandas.to_timedelta(table.time_s, unit="s")
+    for index, columns in ((table.time_s, []), (stamps.rename("when"), ["time_s=when:iso"])):
+        table.drop(columns="time_s").set_index(index).to_parquet(tmp_path / "log.parquet")
+        np.testing.assert_allclose(read_log(tmp_path / "log.parquet", column_map(columns)).time, mine.time)
+
+
+def test_blanks_that_mean_unchanged_are_held_and_named(logs, rows, tmp_path):
+    stepped = rows.assign(heater_power_kW=[rows.heater_power_kW[k // 3 * 3] for k in rows.index])
+    whole = read_log(write(tmp_path / "whole.csv", stepped))
+    blank = stepped.assign(heater_power_kW=stepped.heater_power_kW.where(rows.index % 3 == 0, ""))
+    path = write(tmp_path / "log.csv", blank)
+    held, filled = read_log(path, hold=True), read_log(path)
+    np.testing.assert_array_equal(held.Q_H, whole.Q_H)
+    assert not held.unsure.any()
+    assert np.abs(filled.Q_H - whole.Q_H).max() > 100.0
+    said = "1440 fields of heater_power_kW are blank, and all fit 'unchanged': --hold holds the last value"
+    assert said in filled.notes
+    assert not any("--hold" in note for note in (*whole.notes, *read_log(logs[0]).notes))
+
+
+def test_the_dead_band_of_a_historian_is_named(logs, rows, tmp_path):
+    last, held = -1e9, []
+    for value in rows.T_1_K.astype(float):
+        last = value if abs(value - last) > 0.5 else last
+        held.append(f"{last:.6f}")
+    log = read_log(write(tmp_path / "log.csv", rows.assign(T_1_K=held)))
+    assert any("changes of T_1_K are all of 0.5 K or more, as behind the dead band" in note for note in log.notes)
+    quantised = rows.assign(T_1_K=[f"{round(2.0 * float(value)) / 2.0}" for value in rows.T_1_K])
+    assert not any("dead band" in note for note in read_log(write(tmp_path / "log.csv", quantised)).notes)
+
+
+def test_rows_are_selected_by_what_a_column_says(logs, rows, tmp_path):
+    path, mine = write(tmp_path / "log.csv", phases(rows)), read_log(logs[0])
+    with pytest.raises(CzError, match="--where COLUMN=VALUE"):
+        check_puller(read_log(path), DEFAULT)
+    for where in (["OPERATION=BODY"], ["OPERATION = BODY", "INGOT=7"], ["OPERATION=BODY", "OPERATION=TAIL"]):
+        np.testing.assert_array_equal(read_log(path, where=where).ring, mine.ring)
+    for where, said in (
+        ("OPERATION=BDY", r"no row has OPERATION = 'BDY'; it holds 'BODY' \(2161 rows\), 'NECK' \(100 rows\)"),
+        ("PHASE=BODY", "unknown column 'PHASE'"),
+        ("OPERATION", "--where OPERATION: write it as COLUMN=VALUE"),
+    ):
+        with pytest.raises(CzError, match=said):
+            read_log(path, where=[where])
+    odd = changed("heater_power_kW", "off", 401)(phases(rows).reset_index(drop=True))
+    with pytest.raises(CzError, match=r"row 403: heater_power_kW = 'off'"):
+        read_log(write(tmp_path / "log.csv", odd), where=["OPERATION=BODY"])
+
+
+def test_the_clock_of_the_camera_is_named(rows, tmp_path):
+    for late, said in ((9.0, "the camera's clock is 9 s behind"), (-5.0, "the camera's clock is 5 s ahead")):
+        stamped_rows = rows.assign(frame_time_s=[f"{float(time) - late}" for time in rows.time_s])
+        (note,) = read_log(write(tmp_path / "log.csv", stamped_rows)).notes
+        assert note.startswith(said)
 
 
 @pytest.mark.parametrize("coding", ["latin-1", "utf-16", "utf-8-sig"])
