@@ -281,7 +281,12 @@ def _maximise(logs: Sequence[Log], model: Model, sd: Floats) -> Maximum:
         value, slope, information, out = _likelihood(logs, model, model.mean + away * sd)
         if not np.isfinite(value):
             return np.inf, np.zeros(len(away)), np.eye(len(away)), out
-        return value + 0.5 * away @ away, slope * sd + away, information * np.outer(sd, sd) + np.eye(len(away)), out
+        return (
+            value + 0.5 * float(away @ away),
+            slope * sd + away,
+            information * np.outer(sd, sd) + np.eye(len(away)),
+            out,
+        )
 
     def part(index: int) -> Callable[[Floats], Any]:
         return lambda x: posterior(x.tobytes())[index]
