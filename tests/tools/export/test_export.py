@@ -551,6 +551,7 @@ def test_the_command_writes_a_folder(name, to, files, tmp_path):
         ("nobody --to c", "unknown controller or agent 'nobody'"),
         ("lqg-true --to c", "unknown"),
         ("open-loop --to c", "cannot be exported"),
+        ("compensated --to c", "controllers of whole crystals stay in Python"),
         ("lqg-at-0.02-adaptive --to c", "cannot be exported"),
         ("paper-tuned --to c", "is of another block"),
         ("paper --to st --puller germanium", "is of another block"),
