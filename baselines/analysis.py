@@ -21,10 +21,9 @@ from cz_gym.body.signals import Measured
 from cz_gym.config import Config
 from cz_gym.episodes.scenario import Sensor
 from cz_gym.episodes.scenarios import RANDOMIZED
-from cz_gym.physics.numerics import Floats, StateSpace
 from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.plant import Puller, make_puller
-from cz_gym.process import HEATER_SCALE, PULL_SCALE, scales
+from cz_gym.process import HEATER_SCALE, PULL_SCALE, Floats, StateSpace, scales
 from cz_gym.spaces import DRIVE_CHANNELS, HEATER_RANGE, MEASURED
 from cz_gym.support.errors import CzError, leaves, map_arrays
 

@@ -19,8 +19,18 @@ from cz_gym.engine.batch import Key, first_key
 from cz_gym.episodes.draw import episode_from_key, factors_from_key, new_series, randomised
 from cz_gym.episodes.scenario import GRID, Actuators
 from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, Disturbance, Puller, State, disturbance, make_puller, rk4
-from cz_gym.physics.schedule import bias_offset, reference
+from cz_gym.physics.plant import (
+    HEIGHT_MAX_IN_A,
+    HEIGHT_MIN,
+    Disturbance,
+    Puller,
+    State,
+    bias_offset,
+    disturbance,
+    make_puller,
+    reference,
+    rk4,
+)
 from cz_gym.process import Inputs, scales
 from cz_gym.spaces import STATE, TargetEnv, tag
 from cz_gym.support.errors import CzError, stack

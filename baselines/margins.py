@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from cz_gym.config import Config
 from cz_gym.episodes.scenarios import RANDOMIZED
-from cz_gym.physics.numerics import StateSpace
 from cz_gym.physics.plant import Puller, make_puller
+from cz_gym.process import StateSpace
 from cz_gym.support.errors import CzError
 
 from .analysis import NO_LAGS, SEEN, Lags, LinearForm, close, linear_form, sampled_plant

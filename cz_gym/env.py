@@ -21,10 +21,10 @@ from gymnasium.vector.utils import batch_space
 
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.engine.batch import Batch, SlotState, new_key, processors
-from cz_gym.engine.slots import Out, check_info
+from cz_gym.engine.kernels import Out, check_info
 from cz_gym.episodes.scenario import Distribution, Mixture
 from cz_gym.rendering.canvas import Frame
-from cz_gym.rendering.view import FPS, View, declared_modes, make_view
+from cz_gym.rendering.picture import FPS, View, declared_modes, make_view
 from cz_gym.support.errors import CzError, check_keywords, unknown_name_message
 
 from .config import Config, check_config, make_config, positive_whole

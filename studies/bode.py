@@ -24,8 +24,8 @@ from cz_gym.baselines.analysis import (
 )
 from cz_gym.config import make_config
 from cz_gym.evaluation import user_code
-from cz_gym.physics.numerics import StateSpace
 from cz_gym.physics.plant import make_puller
+from cz_gym.process import StateSpace
 from cz_gym.puller.file import DEFAULT, PullerFile, chosen_puller
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import write_files

@@ -8,8 +8,6 @@ from cz_gym.episodes.draw import randomised
 from cz_gym.jit import force_inlined, jittable, labelled
 from cz_gym.physics import plant
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
-from cz_gym.physics.numerics import StateSpace
-from cz_gym.physics.numerics import linearise as linearise_process
 from cz_gym.physics.parameters import Parameters, check_parameters
 from cz_gym.physics.plant import (
     HEIGHT_MIN,
@@ -18,12 +16,15 @@ from cz_gym.physics.plant import (
     Disturbance,
     Puller,
     State,
+    bias_offset,
     check_height,
     growth,
+    melt_left,
+    reference,
     within_limits,
 )
-from cz_gym.physics.schedule import bias_offset, melt_left, reference
-from cz_gym.process import GROWS, LOST, Inputs, PerfectReadings, Process
+from cz_gym.process import GROWS, LOST, Inputs, PerfectReadings, Process, StateSpace
+from cz_gym.process import linearise as linearise_process
 from cz_gym.support.units import MM
 
 from . import signals

@@ -14,8 +14,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from cz_gym.jit import jittable
-from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, Disturbance, State, growth
-from cz_gym.physics.schedule import bias_offset, recipe, reference
+from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, Disturbance, State, bias_offset, growth, recipe, reference
 from cz_gym.process import HEATER_SCALE, PULL_SCALE, Past, Relative, read_drives, signals
 from cz_gym.process import Channel as Channel
 from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN

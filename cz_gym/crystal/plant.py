@@ -9,9 +9,9 @@ import numpy as np
 
 from cz_gym.episodes.draw import randomised
 from cz_gym.jit import force_inlined, jittable, joined, labelled
-from cz_gym.physics.numerics import clip
 from cz_gym.physics.parameters import CrystalRecipe, Parameters, check_numbers, check_parameters
 from cz_gym.physics.plant import Puller, derive_puller, heating, interface
+from cz_gym.process import clip
 from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.units import MM
 

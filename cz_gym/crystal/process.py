@@ -13,11 +13,9 @@ from cz_gym.episodes.draw import Episode, Factors
 from cz_gym.episodes.rng import normal
 from cz_gym.jit import jittable
 from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.physics.numerics import linearise
 from cz_gym.physics.parameters import check_parameters
-from cz_gym.physics.plant import HEIGHT_MAX_IN_A, hidden_load
-from cz_gym.physics.schedule import DRAW_SPAN, bias_offset
-from cz_gym.process import NO_OPERATING_POINT, Inputs, PerfectReadings
+from cz_gym.physics.plant import DRAW_SPAN, HEIGHT_MAX_IN_A, bias_offset, hidden_load
+from cz_gym.process import NO_OPERATING_POINT, Inputs, PerfectReadings, linearise
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import KILO, MM
 

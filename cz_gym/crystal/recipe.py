@@ -12,8 +12,7 @@ import numpy as np
 from cz_gym.episodes.draw import FREEZES, Stream
 from cz_gym.episodes.rng import uniform
 from cz_gym.jit import jittable, labelled
-from cz_gym.physics.plant import HEIGHT_MAX_IN_A, fourth_power
-from cz_gym.physics.schedule import DRAW_SPAN, quintic
+from cz_gym.physics.plant import DRAW_SPAN, HEIGHT_MAX_IN_A, fourth_power, quintic
 from cz_gym.process import DONE, GROWS, LOST
 from cz_gym.support.units import HOUR, MM
 

@@ -13,7 +13,7 @@ from cz_gym.body import signals as body
 from cz_gym.body.signals import outside
 from cz_gym.jit import jittable
 from cz_gym.physics.meniscus import hurle_slope
-from cz_gym.physics.schedule import bias_offset, drift
+from cz_gym.physics.plant import bias_offset, drift
 from cz_gym.process import DONE, HEATER_SCALE, PULL_SCALE, Relative, read_drives, signals
 from cz_gym.process import Channel as Channel
 from cz_gym.support.units import MINUTE, MM

@@ -27,8 +27,7 @@ from cz_gym.process import NO_OPERATING_POINT, scales
 from cz_gym.spaces import drives_of, lags, observations
 from cz_gym.support.errors import CzError
 
-from .kernels import build_kernels
-from .slots import BatchConstants, ObservationScales, Out, SlotMemory, info_width, slot_type
+from .kernels import BatchConstants, ObservationScales, Out, SlotMemory, build_kernels, info_width, slot_type
 
 
 def processors() -> int:

@@ -7,9 +7,8 @@ import numpy as np
 from cz_gym.episodes.draw import FREEZES, fluctuation, next_fluctuation
 from cz_gym.episodes.scenario import GRID
 from cz_gym.jit import column, force_inlined, inlined, jittable, labelled, scratch, set_column, set_labelled
-from cz_gym.physics.numerics import clip, rk4
-from cz_gym.physics.schedule import bias_offset, drift, pyrometer_drift, ripple
-from cz_gym.process import GROWS, Inputs
+from cz_gym.physics.plant import bias_offset, drift, pyrometer_drift, ripple
+from cz_gym.process import GROWS, Inputs, clip, rk4
 
 _EPS, _POWER, _DRIVES = 1e-9, 3, 4
 
@@ -190,7 +189,7 @@ def sample_sensors(slot: Any, camera: Any, pyrometer: Any, frames: Any, t: Any, 
 # same arithmetic, so that a slot's trajectory does not depend, in any bit, on the slots beside it.
 
 LANES = 8
-"""Slots in lockstep; the rows of a lane are those of :class:`cz_gym.engine.slots.Model`."""
+"""Slots in lockstep; the rows of a lane are those of :class:`cz_gym.engine.kernels.Model`."""
 
 
 @jittable

@@ -21,14 +21,13 @@ from cz_gym.config import Config, check_config, positive_whole
 from cz_gym.episodes.scenario import GRID
 from cz_gym.jit import column, compiled_as, hashed, jittable, kernel, labelled, scratch, set_column
 from cz_gym.physics.meniscus import MeniscusModel
-from cz_gym.physics.numerics import along, plus_product, rk4
-from cz_gym.process import LOST, Inputs, PerfectReadings, Process, Readings
+from cz_gym.process import LOST, Inputs, PerfectReadings, Process, Readings, along, plus_product, rk4
 from cz_gym.spaces import TaggedAction, check_tagged
 from cz_gym.support.errors import CzError
 
 from .batch import Batch, first_key
+from .kernels import Out, model_of
 from .loop import next_inputs
-from .slots import Out, model_of
 
 ACTIONS = 2
 _H = 2.0**-100
@@ -112,7 +111,7 @@ def _stage(work: Any, weight: Any, ahead: Any, x: Any, u: Any, d: Any, p: Any, m
 
 @jittable
 def rk4_by(work: Any, x: Any, u: Any, d: Any, p: Any, dt: Any, model: Any) -> None:
-    """Derivatives of :func:`cz_gym.physics.numerics.rk4` by state and inputs, into ``work[3]``."""
+    """Derivatives of :func:`cz_gym.process.rk4` by state and inputs, into ``work[3]``."""
     for i in range(model.states):
         for j in range(model.memory_at):
             work[1, i, j], work[3, i, j] = 0.0, 1.0 if i == j else 0.0

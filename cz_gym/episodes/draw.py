@@ -4,7 +4,7 @@ A scenario is a record for the compiled draws. Each kind of random number has a 
 number (:func:`stream_number`), so families never share one. Scalars come first on each stream, the noise of each step
 after them in order of time: a longer horizon extends a draw and never changes it, whether it is drawn step by step, as
 the environment does, or as whole series (:func:`episode_from_key`). Ramps are kept as parameters and evaluated where
-needed (:mod:`cz_gym.physics.schedule`).
+needed (:mod:`cz_gym.physics.plant`).
 """
 
 import math
@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from cz_gym.jit import jittable, kernel
 from cz_gym.physics.parameters import Parameters, Range
-from cz_gym.physics.schedule import DRAW_SPAN
+from cz_gym.physics.plant import DRAW_SPAN
 
 from .rng import WORDS, normal, seed_stream, two_normals, uniform
 from .scenario import FAMILIES, GRID, MAX_FLAGGED, MAX_UNFLAGGED, Distribution, Scenario

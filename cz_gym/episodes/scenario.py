@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cz_gym.physics.parameters import MACHINE, MAX_DEAD_TIME, Quantity, Range
-from cz_gym.physics.schedule import DRAW_SPAN
+from cz_gym.physics.plant import DRAW_SPAN
 from cz_gym.support.errors import CzError
 
 NONE: Range = (0.0, 0.0)

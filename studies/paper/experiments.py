@@ -16,8 +16,8 @@ from cz_gym.body.process import RadiusModel, radius_model
 from cz_gym.body.signals import Logged
 from cz_gym.config import make_config
 from cz_gym.evaluation.rollout import Playback, rollout
-from cz_gym.physics.numerics import Floats
-from cz_gym.physics.schedule import quintic
+from cz_gym.physics.plant import quintic
+from cz_gym.process import Floats
 from cz_gym.support.units import HOUR, MINUTE, MM, MM_PER_MIN
 
 MODEL_I = RadiusModel(numerator=-0.0047626, poles=(8.78e-6, -1.684e-3), lead=-47.1864, constant=1.0041)

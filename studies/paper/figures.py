@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from cz_gym import make_puller
 from cz_gym.baselines.analysis import open_loop
 from cz_gym.evaluation.plots import GREY, canvas
-from cz_gym.physics.numerics import Floats
+from cz_gym.process import Floats
 from cz_gym.support.units import MINUTE, MM, MM_PER_MIN
 
 from . import experiments as ex

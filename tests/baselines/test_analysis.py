@@ -32,8 +32,8 @@ from cz_gym.body.signals import Measured
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Scenario, Sensor
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.physics.numerics import StateSpace
 from cz_gym.physics.parameters import Parameters
+from cz_gym.process import StateSpace
 from cz_gym.spaces import MEASURED
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import MM

@@ -16,8 +16,7 @@ from cz_gym.body.signals import Measured, Weights, coefficients
 from cz_gym.config import make_config
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.meniscus import HURLE
-from cz_gym.physics.plant import Disturbance, State, hidden_load, rates
-from cz_gym.physics.schedule import quintic
+from cz_gym.physics.plant import Disturbance, State, hidden_load, quintic, rates
 from cz_gym.process import Inputs
 from cz_gym.puller.file import find_puller
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN

@@ -26,7 +26,7 @@ from cz_gym.baselines.margins import (
 from cz_gym.baselines.pid import CompensatedPID
 from cz_gym.body.signals import Measured
 from cz_gym.config import make_config
-from cz_gym.physics.numerics import StateSpace
+from cz_gym.process import StateSpace
 from cz_gym.spaces import MEASURED
 from cz_gym.support.errors import CzError
 from cz_gym.tools.registry import make_controller

@@ -17,7 +17,6 @@ from cz_gym.engine.tangents import DifferentiableBatch
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.jit import kernel
 from cz_gym.physics.meniscus import hurle_slope
-from cz_gym.physics.numerics import jacobian
 from cz_gym.physics.plant import (
     NO_DISTURBANCE,
     Disturbance,
@@ -28,7 +27,7 @@ from cz_gym.physics.plant import (
     rk4,
     within_limits,
 )
-from cz_gym.process import Inputs
+from cz_gym.process import Inputs, jacobian
 from cz_gym.support.units import HOUR, MM
 from tests.equations import Truth, design_rates, drawn, fields, hold, integrated
 from tests.observed import PLAIN

@@ -24,11 +24,10 @@ from cz_gym.episodes.draw import Episode, Factors
 from cz_gym.episodes.scenarios import NOMINAL
 from cz_gym.physics import plant as body
 from cz_gym.physics.meniscus import HURLE, hurle_height, hurle_slope
-from cz_gym.physics.numerics import rk4
 from cz_gym.physics.parameters import CrystalRecipe
-from cz_gym.physics.schedule import DRAW_SPAN, melt_left
+from cz_gym.physics.plant import DRAW_SPAN, melt_left
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.process import Inputs
+from cz_gym.process import Inputs, rk4
 from cz_gym.puller.file import DEFAULT, PullerFile, find_puller, from_toml
 from cz_gym.spaces import decode
 from cz_gym.support.errors import CzError

@@ -24,7 +24,7 @@ from cz_gym.engine.tangents import DifferentiableBatch
 from cz_gym.evaluation.protocol import Case, Contender
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.jit import force_inlined, jittable
-from cz_gym.physics.schedule import bias_offset, recipe, reference
+from cz_gym.physics.plant import bias_offset, recipe, reference
 from cz_gym.process import DONE, GROWS, LOST, PULL_SCALE, Channel, Inputs, Past, PerfectReadings, Process, Relative
 from cz_gym.tools.report.tables import rows
 from cz_gym.tools.report.task_records import BODY_DRIVES, BODY_ERROR

@@ -10,15 +10,14 @@ from cz_gym import CzVectorEnv
 from cz_gym.body.process import BODY
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.engine.slots import model_of
+from cz_gym.engine.kernels import model_of
 from cz_gym.engine.tangents import STATES, DifferentiableBatch, rk4_by, rows, smooth, work_shape
 from cz_gym.episodes.scenario import Actuators, DriveReadings
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.physics.meniscus import HURLE, hurle_slope
-from cz_gym.physics.numerics import jacobian
 from cz_gym.physics.plant import Disturbance, State, make_puller, rk4
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.process import Inputs
+from cz_gym.process import Inputs, jacobian
 from cz_gym.spaces import ACTIONS, MEASURED
 from tests.observed import PLAIN
 

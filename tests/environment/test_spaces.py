@@ -6,7 +6,7 @@ import pytest
 
 from cz_gym import SCENARIOS, CzEnv, Scenario, decode
 from cz_gym.episodes.scenario import Sensor
-from cz_gym.physics.schedule import bias_offset, pyrometer_drift
+from cz_gym.physics.plant import bias_offset, pyrometer_drift
 from cz_gym.spaces import HISTORY, LAGGED, LAGS, MEASURED, OBSERVATIONS, lags
 from tests.equations import drawn, fields, hold
 from tests.observed import PLAIN

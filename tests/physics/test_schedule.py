@@ -9,10 +9,18 @@ from hypothesis import strategies as st
 
 from cz_gym import SCENARIOS, Parameters, make_puller
 from cz_gym.episodes.draw import Episode, episode_from_key, new_series
-from cz_gym.physics import schedule
 from cz_gym.physics.parameters import MACHINE, SIZES, check_parameters
-from cz_gym.physics.plant import disturbance, hidden_load
-from cz_gym.physics.schedule import bias_offset, drift, pyrometer_drift, recipe, reference, ripple
+from cz_gym.physics.plant import (
+    bias_offset,
+    disturbance,
+    drift,
+    hidden_load,
+    pyrometer_drift,
+    quintic,
+    recipe,
+    reference,
+    ripple,
+)
 
 THREE_HOURS = 10800.0
 
@@ -20,10 +28,10 @@ THREE_HOURS = 10800.0
 def test_quintic_has_no_rate_and_no_curvature_at_its_ends():
     s = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
     points = np.linspace(0, 1, 101)
-    np.testing.assert_allclose(schedule.quintic(points), s(points), atol=1e-15)
+    np.testing.assert_allclose(quintic(points), s(points), atol=1e-15)
     for ends in (s.deriv(1), s.deriv(2)):
         assert ends(np.array([0.0, 1.0])) == pytest.approx([0.0, 0.0], abs=1e-12)
-    assert (schedule.quintic(0.0), schedule.quintic(1.0)) == (0.0, 1.0)
+    assert (quintic(0.0), quintic(1.0)) == (0.0, 1.0)
 
 
 STEPS = Episode(

@@ -17,10 +17,9 @@ from cz_gym import HURLE, CzEnv, Parameters, make_puller
 from cz_gym.env import CzCrystalEnv
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
-from cz_gym.rendering import canvas, view
+from cz_gym.rendering import canvas
 from cz_gym.rendering import picture as triple_point
-from cz_gym.rendering.picture import Ending, Picture
-from cz_gym.rendering.view import MODES, check_size
+from cz_gym.rendering.picture import MODES, Ending, Picture, check_size
 from cz_gym.support.units import MM
 from tests.conftest import ROOT, python
 from tests.observed import PLAIN
@@ -163,7 +162,7 @@ def test_gymnasiums_checker_renders_every_mode_without_a_warning(mode):
 @pytest.mark.parametrize("scenario", ["randomized", "puller"])
 @pytest.mark.parametrize("mode", MODES)
 def test_rendering_changes_nothing(mode, scenario, monkeypatch):
-    monkeypatch.setattr(view, "FPS", 0)  # as fast as it can
+    monkeypatch.setattr("cz_gym.rendering.picture.FPS", 0)  # as fast as it can
     assert pickle.dumps(trajectory(mode, scenario)) == pickle.dumps(trajectory(None, scenario))
 
 

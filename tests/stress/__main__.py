@@ -18,8 +18,7 @@ from cz_gym.config import make_config
 from cz_gym.env import CzVectorEnv
 from cz_gym.episodes.scenario import Interface
 from cz_gym.episodes.scenarios import HARD, PULLER, SCENARIOS
-from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT, fourth_power
-from cz_gym.physics.schedule import melt_left
+from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, RADIUS_LIMIT, fourth_power, melt_left
 from cz_gym.spaces import CLIP, HEATER_RANGE
 from cz_gym.support.units import MM
 from tests.equations import hold

@@ -29,7 +29,7 @@ from cz_gym.crystal.recipe import _Q_H, _ring, _v_p, value
 from cz_gym.engine.batch import SlotState
 from cz_gym.env import CzEnv, EnvState
 from cz_gym.rendering.canvas import Frame
-from cz_gym.rendering.view import record_of
+from cz_gym.rendering.picture import record_of
 from cz_gym.spaces import CLIP, decode
 from cz_gym.support.errors import CzError, leaves, map_arrays
 from cz_gym.support.files import check_writable, name_file_in_errors, write_files
