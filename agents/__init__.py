@@ -13,8 +13,7 @@ from cz_gym.config import Config
 from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.support.errors import unknown_name_message
 
-from .contract import AgentFileError, Contract, read_agent
-from .policy import OnnxPolicy
+from .contract import AgentFileError, Contract, OnnxPolicy, read_agent
 
 __all__ = ["AgentFileError", "Contract", "OnnxPolicy", "load", "shipped", "shipped_names", "shipped_seeds"]
 

@@ -37,11 +37,10 @@ from cz_gym.sb3 import environment_steps
 from cz_gym.support.errors import CzError, software
 from cz_gym.support.files import locked, write_files
 
-from . import validation
+from . import recipes
 from .asymmetric import Asymmetric, LearnState
-from .contract import MAX_JSON_BYTES, AgentFileError, agent_files, read_bounded, read_json
-from .export import to_agent
-from .policy import OnnxPolicy
+from .contract import MAX_JSON_BYTES, AgentFileError, OnnxPolicy, agent_files, read_bounded, read_json
+from .from_sb3 import to_agent
 from .recipes import TrainingConfig, make_algorithm, repeat_of
 
 CHECKPOINT = "checkpoint.zip"
@@ -143,7 +142,7 @@ class TrainingRun:
     folder: Path
     recipe: TrainingConfig
     seed: int
-    references: validation.References
+    references: recipes.References
     """RMSEs of classical controllers on the same crystals, shown beside the agent's."""
     checkpoint_seconds: float = 60.0
     """Longest time between checkpoints, apart from validations and updates in between [s]."""
@@ -242,13 +241,13 @@ class TrainingRun:
         path, config = self.folder / "agent.onnx", self.recipe.config
         normalisation = self.algorithm.get_vec_normalize_env()
         agent = to_agent(self.algorithm, self.recipe.name, self.seed, config, normalisation, path)
-        figures = validation.validate(agent, config, validation.SELECTION_SEEDS)
+        figures = recipes.validate(agent, config, recipes.SELECTION_SEEDS)
         if self.best_cost is None or figures.cost < self.best_cost:
             self.best_cost = figures.cost
             self._keep_agent(agent, figures)
         picked = {name: rmse_mm for name, (rmse_mm, _) in self.references.items()}
         row = self.steps, round(time.monotonic() - self.began, 1), *figures, *picked.values()
-        names = (*validation.COLUMNS, *map(validation.reference_column, picked))
+        names = (*recipes.COLUMNS, *map(recipes.reference_column, picked))
         self.rows.append(dict(zip(names, row, strict=True)))
         text = io.StringIO()
         writer = csv.DictWriter(text, fieldnames=names)
@@ -256,7 +255,7 @@ class TrainingRun:
         writer.writerows(self.rows)
         self.files["progress.csv"] = text.getvalue().encode()
         if self.plot:
-            self.files["progress.png"] = validation.curves({self.recipe.name: [self.rows]})
+            self.files["progress.png"] = recipes.curves({self.recipe.name: [self.rows]})
         self.save()
         for name, figure in figures._asdict().items():
             self.logger.record(f"validation/{name}", figure)
@@ -269,12 +268,12 @@ class TrainingRun:
     def finish(self) -> dict[str, float]:
         """Test the best agent on episodes that did not choose it; returns the content of ``summary.json``."""
         agent = OnnxPolicy.load(self.folder / "agent.onnx", self.recipe.config)
-        figures = validation.validate(agent, self.recipe.config, validation.JUDGING_SEEDS)
+        figures = recipes.validate(agent, self.recipe.config, recipes.JUDGING_SEEDS)
         summary = {
-            "validation_episodes": len(validation.JUDGING_SEEDS),
+            "validation_episodes": len(recipes.JUDGING_SEEDS),
             "validation_cost": figures.cost,
             "validation_rmse_mm": figures.rmse_mm,
-            **{validation.reference_column(name): judged for name, (_, judged) in self.references.items()},
+            **{recipes.reference_column(name): judged for name, (_, judged) in self.references.items()},
             "pull_step_rms_mm_per_min": figures.pull_step_rms_mm_per_min,
             "failure_rate": figures.failure_rate,
             "chosen_at": agent.contract.training_steps,
@@ -294,7 +293,7 @@ class TrainingRun:
         share = min(float(rows[-1]["steps"]) / self.recipe.steps, 1.0)
         return share, f"{self.seed}: {share:.0%} {float(rows[-1]['validation_rmse_mm']):.3f} mm"
 
-    def _keep_agent(self, agent: OnnxPolicy, figures: validation.Validation) -> None:
+    def _keep_agent(self, agent: OnnxPolicy, figures: recipes.Validation) -> None:
         """Put an agent with its figures into the next checkpoint."""
         contract = figures.put_into(replace(agent.contract, training_steps=self.steps))
         files = agent_files(self.folder / "agent.onnx", agent.content, contract)
@@ -377,7 +376,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         return []
     try:
         rows = list(csv.DictReader(io.StringIO(read_bounded(path, MAX_JSON_BYTES).decode(), newline="")))
-        columns = list(validation.COLUMNS)
+        columns = list(recipes.COLUMNS)
         named = all(list(row)[: len(columns)] == columns for row in rows)
         if not named or not all(math.isfinite(float(value)) for row in rows for value in row.values()):
             raise ValueError

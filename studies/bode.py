@@ -23,7 +23,7 @@ from cz_gym.baselines.analysis import (
     stable_range,
 )
 from cz_gym.config import make_config
-from cz_gym.evaluation import user_code
+from cz_gym.evaluation.protocol import user_controller
 from cz_gym.physics.plant import make_puller
 from cz_gym.process import StateSpace
 from cz_gym.puller.file import DEFAULT, PullerFile, chosen_puller
@@ -42,7 +42,7 @@ def form_of(name: str, puller: PullerFile = DEFAULT) -> LinearForm:
     """Linearise a shipped controller, or ``FILE.py:NAME``; ValueError says in one line why it has no linear form."""
     config = make_config("nominal", observation="measured", action="direct", puller=puller)
     sensor = make_config("randomized", puller=puller).sole_scenario.sensor
-    policy = user_code.controller(name).make(config) if ":" in name else make_controller(name, config)
+    policy = user_controller(name).make(config) if ":" in name else make_controller(name, config)
     return linear_form(policy, sensor)
 
 

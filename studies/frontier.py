@@ -20,9 +20,9 @@ from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import write_files
 from cz_gym.tools.episodes import read_episodes, read_estimates, values_of
-from cz_gym.tools.files import EPISODES
 from cz_gym.tools.registry import CONTROLLERS
 from cz_gym.tools.report.tables import markdown
+from cz_gym.tools.run import EPISODES
 
 ACTIVITY, RETURN = "pull_step_rms_mm_per_min", "return"
 RESAMPLES = 2_000

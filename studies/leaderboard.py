@@ -28,13 +28,12 @@ from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import check_writable, name_file_in_errors, write_files
 from cz_gym.tools.episodes import Benchmark, by_key, read_estimates
-from cz_gym.tools.files import to_json
 from cz_gym.tools.registry import CONTROLLERS
 from cz_gym.tools.report.markdown import summary
 from cz_gym.tools.report.tables import RMSE
 from cz_gym.tools.report.tables import markdown as table
 from cz_gym.tools.report.task_records import contract_hash
-from cz_gym.tools.run import check_agents, run
+from cz_gym.tools.run import check_agents, run, to_json
 
 FRESH = range(3_000_000, 2**31)
 """Seeds that no training, validation or test uses."""

@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from cz_gym.agents.from_sb3 import ALGORITHMS
-from cz_gym.agents.validation import JUDGING_SEEDS, validate
+from cz_gym.agents.recipes import JUDGING_SEEDS, validate
 from cz_gym.config import make_config
 from cz_gym.support.command_line import between
 from cz_gym.support.errors import CzError, unknown_name_message
@@ -90,7 +90,7 @@ def train(name: str, seed: int) -> list[tuple[Any, ...]]:
     import torch
     from stable_baselines3.common.vec_env import VecNormalize
 
-    from cz_gym.agents.export import to_agent
+    from cz_gym.agents.from_sb3 import to_agent
     from cz_gym.sb3 import make_vec_env
 
     torch.set_num_threads(1)

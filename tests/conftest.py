@@ -105,11 +105,11 @@ def refused(capsys):
 @pytest.fixture
 def few_crystals(monkeypatch):
     """Training runs of this process pick and judge on two crystals each."""
-    from cz_gym.agents import validation
+    from cz_gym.agents import recipes
     from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 
-    monkeypatch.setattr(validation, "SELECTION_SEEDS", VALIDATION_SEEDS[:2])
-    monkeypatch.setattr(validation, "JUDGING_SEEDS", VALIDATION_SEEDS[2:4])
+    monkeypatch.setattr(recipes, "SELECTION_SEEDS", VALIDATION_SEEDS[:2])
+    monkeypatch.setattr(recipes, "JUDGING_SEEDS", VALIDATION_SEEDS[2:4])
     monkeypatch.setattr("cz_gym.agents.from_sb3.JUDGING_SEEDS", VALIDATION_SEEDS[2:4])
 
 

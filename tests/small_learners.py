@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from cz_gym.agents import validation
+from cz_gym.agents import recipes
 from cz_gym.agents.asymmetric import LearnState
 from cz_gym.agents.recipes import APG, PPO, SAC, TrainingConfig, make_algorithm, repeat_of
 from cz_gym.agents.train import TrainingRun
@@ -15,13 +15,13 @@ SMALL_SAC = SAC(
 SMALL_APG = APG(num_envs=4, window=20, steps=160)
 QUICK = PPO(num_envs=64, action_repeat=2, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,), fewest_updates=1)
 """For runs of ``train.py``."""
-REFERENCES = dict.fromkeys(validation.REFERENCES["Cz-v0"], (0.2, 0.1))
+REFERENCES = dict.fromkeys(recipes.REFERENCES["Cz-v0"], (0.2, 0.1))
 TRAIN = TrainingRun.train
 
 
 def train_small(run: TrainingRun, bar: Any = None) -> dict[str, float]:
     """:meth:`TrainingRun.train` with few validation episodes."""
-    validation.SELECTION_SEEDS, validation.JUDGING_SEEDS = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]
+    recipes.SELECTION_SEEDS, recipes.JUDGING_SEEDS = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]
     return TRAIN(run, bar)
 
 

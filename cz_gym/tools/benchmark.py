@@ -7,17 +7,24 @@ from dataclasses import replace
 from pathlib import Path
 
 from cz_gym.agents import OnnxPolicy, shipped_names, shipped_seeds
-from cz_gym.evaluation import user_code
-from cz_gym.evaluation.protocol import SLOW_EPISODES, Case, Contender, agent, find_case
+from cz_gym.evaluation.protocol import (
+    SLOW_EPISODES,
+    Case,
+    Contender,
+    agent,
+    check_apart,
+    find_case,
+    user_case,
+    user_controller,
+)
 from cz_gym.puller.file import chosen_puller
 from cz_gym.support.command_line import OneLineParser, between, relative_path, run_command
 from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.units import MM
 from cz_gym.tools.report.markdown import terminal
 
-from .files import check_targets, write
 from .report.task_records import TASKS
-from .run import check_agents, is_cached, run
+from .run import check_agents, check_targets, is_cached, run, write
 
 CLONE = Path(__file__).resolve().parents[2]
 RESULTS = CLONE / "results" if (CLONE / "results" / "benchmark").is_dir() else Path("runs")
@@ -143,8 +150,8 @@ def cases_of(arguments: argparse.Namespace) -> list[Case]:
     if arguments.tolerance is not None and not (graded and 0.0 < arguments.tolerance <= 50.0):
         raise CzError(f"--tolerance {arguments.tolerance:g} must be up to 50 mm, beside --puller FILE.toml, of Cz-v0")
     names = arguments.scenarios or [case.name for case in task.cases if case.default and not arguments.scenario]
-    cases = [*(find_case(name, task.cases) for name in names), *map(user_code.case, arguments.scenario)]
-    user_code.check_apart([case.name for case in cases], "scenario")
+    cases = [*(find_case(name, task.cases) for name in names), *map(user_case, arguments.scenario)]
+    check_apart([case.name for case in cases], "scenario")
     puller = chosen_puller(arguments.puller)
     tolerance = 0.5 * MM * (arguments.tolerance or 1.0) if graded else None
     return [replace(case, puller=puller, tolerance=tolerance, process=task.cases[0].process) for case in cases]
@@ -156,11 +163,11 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
     Those of the user's files always take part, shipped agents by default if no agent is given, slow controllers if
     ``--slow`` asks for them, or if they are named and all their episodes cached.
     """
-    own, given = [user_code.controller(place) for place in arguments.controller], given_agents(arguments)
+    own, given = [user_controller(place) for place in arguments.controller], given_agents(arguments)
     controllers, shipped = TASKS[arguments.env].controllers(), shipped_names(arguments.env)
     names = [each.name for each in controllers]
     new = [name for name in given if name not in shipped]
-    user_code.check_apart([*names, *shipped, *new, *(each.name for each in own)], "controller")
+    check_apart([*names, *shipped, *new, *(each.name for each in own)], "controller")
     wanted = wanted_names(arguments, cases, list(given) or ([] if arguments.puller else shipped))
     for name in wanted:
         if name not in (known := [*names, *new, *shipped]):

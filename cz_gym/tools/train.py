@@ -71,8 +71,8 @@ def train(arguments: argparse.Namespace) -> int:
         import matplotlib  # noqa: F401  # if it is missing, say so before the training
     from tqdm import tqdm
 
+    from cz_gym.agents.recipes import references
     from cz_gym.agents.train import TrainingRun, train_seeds
-    from cz_gym.agents.validation import references
 
     folders = [arguments.out.resolve() / f"seed{seed}" for seed in arguments.seeds or ()] or [arguments.out]
     recipe, seed = _recipe_and_seed(arguments, folders)

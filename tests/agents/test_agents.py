@@ -10,7 +10,7 @@ import pytest
 from cz_gym import agents
 from cz_gym.agents import AgentFileError, OnnxPolicy
 from cz_gym.agents.contract import MAX_BYTES, read_agent, write_agent
-from cz_gym.agents.export import to_onnx
+from cz_gym.agents.from_sb3 import to_onnx
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.spaces import HISTORY

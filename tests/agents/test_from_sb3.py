@@ -21,7 +21,7 @@ from cz_gym import CzEnv, sb3
 from cz_gym.agents import AgentFileError, OnnxPolicy, from_sb3
 from cz_gym.agents.apg import APG
 from cz_gym.agents.contract import make_contract
-from cz_gym.agents.export import to_onnx
+from cz_gym.agents.from_sb3 import to_onnx
 from cz_gym.config import make_config
 from cz_gym.spaces import HISTORY
 from tests.contracts import facts

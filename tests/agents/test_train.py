@@ -16,7 +16,7 @@ import torch
 from tqdm import tqdm
 
 from cz_gym import CzEnv
-from cz_gym.agents import AgentFileError, OnnxPolicy, load, validation
+from cz_gym.agents import AgentFileError, OnnxPolicy, load, recipes
 from cz_gym.agents import train as training
 from cz_gym.agents.recipes import CRYSTAL_RECIPES, PPO, RECIPES, make_algorithm
 from cz_gym.agents.train import CHECKPOINT, TrainingRun, load_checkpoint, restore, to_bytes
@@ -98,8 +98,8 @@ def test_a_resumed_sac_keeps_its_temperature_and_fills_a_new_replay_buffer_befor
 def quick(monkeypatch, few_crystals):
     monkeypatch.setitem(RECIPES, "ppo", QUICK)
     monkeypatch.setitem(CRYSTAL_RECIPES, "ppo", replace(QUICK, name="ppo-along", **ALONG))
-    for recipes in (RECIPES, CRYSTAL_RECIPES):
-        monkeypatch.setitem(recipes, "gradient", replace(recipes["gradient"], num_envs=64, window=12))
+    for known in (RECIPES, CRYSTAL_RECIPES):
+        monkeypatch.setitem(known, "gradient", replace(known["gradient"], num_envs=64, window=12))
 
 
 def rows(folder):
@@ -231,7 +231,7 @@ def seeds(monkeypatch, few_crystals):
 
     monkeypatch.setattr(TrainingRun, "train", counted)
     monkeypatch.setattr(training, "run_parallel", in_turn)
-    monkeypatch.setattr(validation, "references", lambda *_: REFERENCES)
+    monkeypatch.setattr(recipes, "references", lambda *_: REFERENCES)
     monkeypatch.setitem(RECIPES, "ppo", SMALL_PPO)
     return seeds
 
@@ -356,16 +356,16 @@ SEEDS = range(1_000_000, 1_000_006)
 
 
 def test_crystals_that_judge_neither_select_nor_test():
-    judged = set(validation.JUDGING_SEEDS)
+    judged = set(recipes.JUDGING_SEEDS)
     assert judged <= set(VALIDATION_SEEDS)
-    assert not judged & (set(validation.SELECTION_SEEDS) | set(TEST_SEEDS))
+    assert not judged & (set(recipes.SELECTION_SEEDS) | set(TEST_SEEDS))
 
 
 @pytest.mark.parametrize("scenario", ["randomized", "randomized=0.4,hard=0.2,puller=0.4"])
 def test_a_reference_has_its_design_for_each_crystal(scenario, monkeypatch):
-    monkeypatch.setattr(validation, "SELECTION_SEEDS", SEEDS)
-    monkeypatch.setattr(validation, "JUDGING_SEEDS", SEEDS[:1])
-    monkeypatch.setattr(validation, "REFERENCES", {"Cz-v0": ("paper-tuned",)})
+    monkeypatch.setattr(recipes, "SELECTION_SEEDS", SEEDS)
+    monkeypatch.setattr(recipes, "JUDGING_SEEDS", SEEDS[:1])
+    monkeypatch.setattr(recipes, "REFERENCES", {"Cz-v0": ("paper-tuned",)})
     recipe = replace(PPO(), scenario=scenario)
     config = replace(recipe.config, observation="measured", action="direct")
     errors, drawn = [], set()
@@ -375,6 +375,6 @@ def test_a_reference_has_its_design_for_each_crystal(scenario, monkeypatch):
         own = config.with_scenario(name)
         errors.append(metrics(rollout(make_controller("paper-tuned", own), own, [seed])).rmse_mm[0])
         drawn.add(name)
-    found = validation.references(make_controller, recipe)
+    found = recipes.references(make_controller, recipe)
     assert found == {"paper-tuned": pytest.approx((np.mean(errors), errors[0]), rel=1e-12)}
     assert len(drawn) == (1 if scenario == "randomized" else 3)

@@ -12,8 +12,7 @@ from cz_gym import SCENARIOS, CzEnv, Scenario
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Drift, Faults, Interface, Pullers, TemperatureRamp, to_csv
 from cz_gym.episodes.scenarios import find_scenario, mix_of
-from cz_gym.evaluation.protocol import find_case
-from cz_gym.evaluation.user_code import case
+from cz_gym.evaluation.protocol import find_case, user_case
 from cz_gym.puller.file import find_puller
 from cz_gym.support.errors import CzError
 
@@ -150,7 +149,7 @@ def test_a_puller_of_one_s_own_keeps_them_and_other_contents_are_another_scenari
     one, other = (path.with_name(f"{k}.csv") for k, path in enumerate((place, place)))
     one.write_text(to_csv([FIRST]))
     other.write_text(to_csv([SECOND]))
-    scenario = case(str(one)).scenario
+    scenario = user_case(str(one)).scenario
     config = make_config(one, puller=find_puller("germanium"))
     assert config.sole_scenario.series == scenario.series == find_scenario(one).series
     assert len(scenario.series) == 7

@@ -13,10 +13,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from cz_gym.evaluation import parallel, user_code
+from cz_gym.evaluation import parallel
 from cz_gym.evaluation.metrics import SPEED
 from cz_gym.evaluation.parallel import in_processes
-from cz_gym.evaluation.protocol import find_case
+from cz_gym.evaluation.protocol import find_case, user_controller
 from cz_gym.support.errors import CzError
 from cz_gym.tools.registry import find_controller
 from cz_gym.tools.run import run
@@ -133,7 +133,7 @@ def workers(tmp_path, dask):
 @pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
 def test_two_workers_one_killed_bring_the_same_table(workers, tmp_path):
     (tmp_path / "mine.py").write_text(ONCE)
-    contenders = [user_code.controller(f"{tmp_path / 'mine.py'}:once"), *map(find_controller, ("paper", "paper-tuned"))]
+    contenders = [user_controller(f"{tmp_path / 'mine.py'}:once"), *map(find_controller, ("paper", "paper-tuned"))]
     rows = [find_case("nominal"), find_case("randomized")]
     with ThreadPoolExecutor() as pool:
         there = pool.submit(run, contenders, rows, 2, tmp_path, None, True, workers)

@@ -19,8 +19,8 @@ from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.protocol import user_controller
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.evaluation.user_code import controller
 from cz_gym.sb3 import CzVecEnv
 from cz_gym.support.units import KILO, MINUTE, MM_PER_MIN
 from cz_gym.tools.registry import make_controller
@@ -73,7 +73,7 @@ def test_an_example_without_its_packages_says_in_one_line_what_to_install():
 def test_the_predictive_controller_holds_a_crystal_as_lqg_does():
     config = make_config(horizon=600.0, **PLAIN)
     own, lqg = (
-        rollout(policy, config, SEEDS) for policy in (controller(MPC).make(config), make_controller("lqg", config))
+        rollout(policy, config, SEEDS) for policy in (user_controller(MPC).make(config), make_controller("lqg", config))
     )
     assert not own.failed.any()
     np.testing.assert_allclose(metrics(own).rmse_mm, metrics(lqg).rmse_mm, rtol=0.05)
@@ -85,7 +85,7 @@ def test_the_predictive_controller_asks_for_nothing_beyond_the_limits_of_the_dri
     )
     config = make_config(replace(RANDOMIZED, name="narrow", actuators=actuators), horizon=300.0, **PLAIN)
     with pytest.warns(UserWarning, match=r"lqg was not tuned for actuators\.pull_window"):
-        run = rollout(controller(MPC).make(config), config, SEEDS)
+        run = rollout(user_controller(MPC).make(config), config, SEEDS)
     pull = run.signals.v_p - config.parameters.v_0
     assert not run.failed.any()
     assert np.abs(pull).max() == pytest.approx(actuators.pull_window, rel=1e-3)

@@ -27,8 +27,8 @@ from cz_gym.spaces import OBSERVATIONS
 from cz_gym.support.errors import CzError
 from cz_gym.tools import benchmark, run
 from cz_gym.tools.episodes import read_episodes, values_of
-from cz_gym.tools.files import check_targets
 from cz_gym.tools.registry import CONTROLLERS
+from cz_gym.tools.run import check_targets
 from tests.conftest import python
 from tests.contracts import LINEAR, facts, model_of
 from tests.observed import PLAIN

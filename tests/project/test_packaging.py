@@ -216,7 +216,7 @@ def plain(name):
 
 USES = {
     "benchmark": "run('benchmark --controllers paper --scenarios nominal --episodes 1 --quiet --out', out)",
-    "agents": "import cz_gym.agents.train, cz_gym.agents.apg, cz_gym.agents.export, cz_gym.agents.asymmetric",
+    "agents": "import cz_gym.agents.train, cz_gym.agents.apg, cz_gym.agents.from_sb3, cz_gym.agents.asymmetric",
     "render": "import gymnasium; e = gymnasium.make('cz_gym:Cz-v0', render_mode='rgb_array'); e.reset(); e.render()",
     "mpc": "from examples.mpc import mpc; import cz_gym.config as c; mpc(c.make_config('nominal')).programme",
     "data": "run('data --policies paper --scenarios nominal --episodes 1 --out', out)",

@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 
 from cz_gym.agents import AgentFileError, OnnxPolicy, shipped
 from cz_gym.agents.contract import make_contract, read_agent
+from cz_gym.agents.recipes import COLUMNS
 from cz_gym.agents.train import load_checkpoint, read_rows, read_settings, restore, to_bytes
-from cz_gym.agents.validation import COLUMNS
 
 SPARE = 1_000_000_000
 """Memory beyond what is used already [bytes]."""

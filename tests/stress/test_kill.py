@@ -15,7 +15,7 @@ from dataclasses import replace
 import pytest
 from tqdm import tqdm
 
-from cz_gym.agents import OnnxPolicy, validation
+from cz_gym.agents import OnnxPolicy, recipes
 from cz_gym.agents import train as run
 from cz_gym.agents.recipes import RECIPES
 from cz_gym.agents.train import load_checkpoint
@@ -65,7 +65,7 @@ def kill_at(point):
 def training(arguments, point, log):
     """train.py on less of everything, with a checkpoint at every step, up to a point."""
     tqdm.set_lock(threading.RLock())  # its own is a semaphore, which a killed process leaves behind
-    validation.SELECTION_SEEDS, validation.JUDGING_SEEDS = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]
+    recipes.SELECTION_SEEDS, recipes.JUDGING_SEEDS = VALIDATION_SEEDS[:2], VALIDATION_SEEDS[2:4]
     run.VALIDATE_EVERY = 4096
     RECIPES["ppo"] = replace(QUICK, steps=8192, action_repeat=1, batch_size=512, n_epochs=2, control_interval=30.0)
     if point is not None:

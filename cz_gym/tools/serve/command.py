@@ -80,8 +80,7 @@ def _is_loopback(host: str) -> bool:
 async def serving(arguments: argparse.Namespace, access: Any) -> AsyncIterator[tuple[Any, asyncio.Task[None]]]:
     """Run a crystal, its server and page; yields the machine, and a task that ends only if the plant's thread fails."""
     from .machine import Clock, CrystalMachine, LogFile, Machine, StateFile
-    from .opcua import Tags, certify, publish_tags
-    from .page import Page
+    from .opcua import Page, Tags, certify, publish_tags
 
     if arguments.log_size and not arguments.log:
         raise CzError("--log-size divides the file of --log, which is not named")

@@ -16,7 +16,7 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 
 from cz_gym import CzEnv, agents
-from cz_gym.agents.export import to_onnx
+from cz_gym.agents.from_sb3 import to_onnx
 from cz_gym.body.signals import Measured
 from cz_gym.config import make_config
 from cz_gym.env import CzVectorEnv
