@@ -13,6 +13,7 @@ from plotly.graph_objects import Figure
 from plotly.offline import get_plotlyjs
 from plotly.subplots import make_subplots
 
+from cz_gym.baselines.margins import EXPLAINED as BEARS
 from cz_gym.env import CzEnv
 from cz_gym.evaluation.plots import COLUMNS, GREY, INK, MARKERS, styles_of
 from cz_gym.evaluation.protocol import Case
@@ -238,7 +239,7 @@ def _for_a_grower(benchmark: Benchmark) -> dict[str, str]:
         "best_note": escape(" ".join((markdown.EXPLAINED, *markdown.warnings(benchmark)))),
         "question": "What the loops bear",
         "scenarios": _table(markdown.MARGINS, markdown.margins(benchmark)),
-        "answer_note": escape(markdown.BEARS),
+        "answer_note": escape(BEARS),
     }
 
 
