@@ -49,7 +49,7 @@ def shows_settings(cls: Any) -> Any:
     positions = any(each.kind is each.VAR_POSITIONAL for each in own)
     own = [each for each in own if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)]
     left_out = {"process", *(each.name for each in own)} if not positions else {each.name for each in own}
-    settings = signature(make_config if positions else cls.__base__).parameters.values()
+    settings = [*signature(make_config if positions else cls.__base__).parameters.values()]
     settings = [each for each in settings if each.name not in left_out]
     settings = settings if positions else [each.replace(kind=each.KEYWORD_ONLY) for each in settings]
     cls.__signature__ = Signature(sorted([*own, *settings], key=lambda each: each.kind))
