@@ -399,7 +399,8 @@ def test_an_lqg_knows_less_of_the_radius_when_it_is_called_late():
     def variance(pace):
         memory = block.start(1)
         for time in np.arange(0.0, 600.0, pace):
-            _, memory = block.run(nominal({"time_s": time, "ring_time_s": time}), memory)
+            given = {"time_s": time, "ring_time_s": time, "ring_still_s": 1e9}
+            _, memory = block.run(nominal(given), memory)
         return memory.controller.filter.covariance[0, 0, 0]
 
     assert variance(15.0) > 1.2 * variance(5.0)
