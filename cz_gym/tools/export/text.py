@@ -186,9 +186,8 @@ def test_vector(block: Block) -> str:
         given |= {"T_1_K": np.nan} if 120 <= k < 130 else {}
         given |= {"pull_speed_mm_per_min": pull, "heater_power_kW": heater}
         outputs, memory = block.run(given, memory)
-        shown = [float(outputs[port.name][0]) for port in OUTPUTS]
-        pull, heater = shown[:2]
-        lines.append(",".join(f"{value:.17g}" for value in (*given.values(), *shown)))
+        pull, heater, alarms = (float(outputs[port.name][0]) for port in OUTPUTS)
+        lines.append(",".join(f"{value:.17g}" for value in (*given.values(), pull, heater, alarms)))
     return "\n".join(lines) + "\n"
 
 
