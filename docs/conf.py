@@ -18,10 +18,10 @@ language = "en"
 root_doc = "docs/index"
 include_patterns = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/**.md", "results/**.md"]
 exclude_patterns = [".*", "build", "dist", "runs", "results/cache", "results/README.md", "docs/_*", "**/.*"]
-exclude_patterns += ["**/node_modules"]
+exclude_patterns += ["**/node_modules", "results/robustness"]
 extensions = ["myst_parser", "sphinx.ext.autodoc", "czdocs.mathml", "czdocs.tables", "czdocs.names"]
 nitpicky = True
-nitpick_ignore = [("py:func", "make_config")]
+nitpick_ignore = [("py:func", "make_config"), ("py:func", "prior_sds"), ("py:class", "Variation")]
 nitpick_ignore_regex = [
     # Other projects' names; their inventories would have to be fetched.
     (r"py:.*", r"(numpy|np|npt|gymnasium|gym|collections|typing|pathlib|ndarray|optional|Callable|Any|Floats)\b.*"),
