@@ -24,7 +24,6 @@ from cz_gym.config import Config, make_config
 from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.env import CzVectorEnv
 from cz_gym.evaluation.metrics import Metrics, metrics
-from cz_gym.evaluation.plots import INK, canvas, png, styles
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS, scenarios
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.sb3 import ActionRepeat, CzVecEnv
@@ -348,6 +347,8 @@ def curves(runs: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> bytes:
 
     ``runs`` are the rows of ``progress.csv`` of each run, by the name of their agents.
     """
+    from cz_gym.evaluation.plots import INK, canvas, png, styles  # matplotlib is in another extra
+
     figure, style = canvas(9.4, 4.6), styles([*runs])
     panels = figure.subplots(1, 2, sharey=True)
     last = next(iter(runs.values()))[0][-1]

@@ -227,7 +227,6 @@ USES = {
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=False, reason="failed since modules were merged; the cause is not found yet")
 @pytest.mark.parametrize("extra", USES)
 def test_an_extra_alone_brings_all_that_its_use_needs(extra, tmp_path):
     """Minari imports Pillow and does not require it: it was there because matplotlib was."""
@@ -253,7 +252,6 @@ def source(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=False, reason="failed since modules were merged; the cause is not found yet")
 def test_the_wheel_holds_one_package_and_what_it_needs(source, tmp_path):
     python("-m", "build", "--no-isolation", "--outdir", str(tmp_path), str(source))
     with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as archive:
@@ -271,7 +269,7 @@ def test_the_wheel_holds_one_package_and_what_it_needs(source, tmp_path):
         kept = {name.partition("/")[2] for name in archive.getnames()}
     assert {"Makefile", "train.py", "studies/paper/__main__.py", "tests/conftest.py", "CITATION.cff"} <= kept
     home = tmp_path / "installed" / "cz_gym"
-    modules = [home / "__init__.py", home / "cz_gym/tools/registry.py", home / "agents/contract.py"]
+    modules = [home / "__init__.py", home / "tools/registry.py", home / "agents/contract.py"]
     assert printed(NAMES, home.parent, tmp_path) == list(map(str, modules))
     script = str(ROOT / "tests" / "golden" / "digest.py")
     code = f"{SMOKE}\nimport runpy\nrunpy.run_path({script!r}, run_name='__main__')"
