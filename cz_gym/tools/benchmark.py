@@ -165,28 +165,32 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
     """
     own, given = [user_controller(place) for place in arguments.controller], given_agents(arguments)
     controllers, shipped = TASKS[arguments.env].controllers(), shipped_names(arguments.env)
-    names = [each.name for each in controllers]
-    new = [name for name in given if name not in shipped]
-    check_apart([*names, *shipped, *new, *(each.name for each in own)], "controller")
-    wanted = wanted_names(arguments, cases, list(given) or ([] if arguments.puller else shipped))
+    known = [*(each.name for each in controllers), *(name for name in given if name not in shipped), *shipped]
+    check_apart([*known, *(each.name for each in own)], "controller")
+    wanted = wanted_names(arguments, cases, [*given] or ([] if arguments.puller else shipped))
     for name in wanted:
-        if name not in (known := [*names, *new, *shipped]):
+        if name not in known:
             raise CzError(unknown_name_message("controller", name, known, ", or all"))
     chosen = [each for each in controllers if each.name in wanted]
-    for each in chosen:
-        if not may_run(each, arguments, cases):
-            raise CzError(f"{each.name!r} is slow: add --slow to run it on the first {SLOW_EPISODES} episodes")
-    chosen += agents_of(given, [name for name in shipped if name in wanted])
+    check_quick(chosen, arguments, cases)
+    chosen += agents_of(given, shipped, wanted)
     check_agents(chosen, cases)
     if not (chosen or own):
         raise CzError("no controller takes part: name some with --controllers")
     return [*chosen, *own]
 
 
-def agents_of(given: Mapping[str, Contender], shipped: Sequence[str]) -> list[Contender]:
-    """Return the agents of the user's files, then the shipped ones of these names that no file replaces."""
-    files = {name: shipped_seeds(name) for name in shipped if name not in given}
+def agents_of(given: Mapping[str, Contender], shipped: Sequence[str], wanted: Sequence[str]) -> list[Contender]:
+    """Return the agents of the user's files, then the shipped ones that are wanted and that no file replaces."""
+    files = {name: shipped_seeds(name) for name in shipped if name in wanted and name not in given}
     return [*given.values(), *(agent(name, [*map(OnnxPolicy.load, some)]) for name, some in files.items())]
+
+
+def check_quick(chosen: Sequence[Contender], arguments: argparse.Namespace, cases: Sequence[Case]) -> None:
+    """Raise CzError for a slow controller that may not run."""
+    for each in chosen:
+        if not may_run(each, arguments, cases):
+            raise CzError(f"{each.name!r} is slow: add --slow to run it on the first {SLOW_EPISODES} episodes")
 
 
 def may_run(contender: Contender, arguments: argparse.Namespace, cases: Sequence[Case]) -> bool:

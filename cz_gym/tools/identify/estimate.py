@@ -5,7 +5,7 @@ Prediction errors, operating point and noise at the maximum say whether the mode
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -192,26 +192,15 @@ def identify(
     free = (*((*HEATER, *LAGS) if heater >= 1.0 else ()), *(PULL if pull >= 1.0 else ()))
     model = Model((*free, *NoiseLevels._fields), start.parameters, meniscus, _lags_of(start, heater >= 1.0))
     sd, latency = np.array([sds[name] for name in model.names]), start.latency or 0.0
-    rows = [prepare(each, latency) for each in logs]
-    best = _maximise(rows, model, sd)
+    rows, best = _fit(logs, latency, model, sd)
     if "heater_lag" in free and (total := _delay(best, model))[0] + 2.0 * total[1] < 0.0:
         logs = tuple(map(shift_drives, logs))
-        rows = [prepare(each, latency) for each in logs]
-        best = _maximise(rows, model, sd)
-
-    def estimate(name: str) -> Estimate:
-        usual = model.value(name, LAM if name == "lam" else 0.0)
-        if name not in model.names:
-            return Estimate(name, usual, usual, usual, usual, 1.0, excited=False)
-        j = model.names.index(name)
-        deviation = min(best.sd[j], sd[j])  # WIDER is no reason to know less than before
-        low, value, high = (model.value(name, best.theta[j] + sign * 1.96 * deviation) for sign in (-1.0, 0.0, 1.0))
-        delay = name not in LAGS or np.subtract(*(_delay(best, model) * (1.0, 2.0))) > 0.5 * logs[0].interval
-        return Estimate(name, usual, value, low, high, deviation / sd[j], trusted=bool(delay))
+        rows, best = _fit(logs, latency, model, sd)
 
     whole = join_logs(rows)
     read = np.isfinite([whole.T_1, whole.ring]).T
     errors = np.where(read, best.out.error / np.sqrt(best.out.variance), np.nan)
+    estimate = partial(_estimate, best=best, model=model, sd=sd, interval=logs[0].interval)
     told, noise = tuple(map(estimate, (*HEATER, *LAGS, *PULL))), tuple(map(estimate, NoiseLevels._fields))
     gain = _ring_gain(rows, model, best, sd) if pull >= 1.0 else (1.0, np.inf)
     result = Identified(start, told, noise, (pull, heater), errors, best.out, tuple(rows), best.settled, gain, sds)
@@ -267,6 +256,24 @@ def _delay(best: Maximum, model: Model) -> Floats:
     slopes = {"heater_lag": lags.heater_lag, "heater_dead_time": 1.0, "pyrometer_filter": lags.pyrometer_filter}
     slope = np.array([slopes.get(name, 0.0) for name in model.names])
     return np.array([sum(lags), np.sqrt(slope @ best.covariance @ slope)])
+
+
+def _fit(logs: Sequence[Log], latency: float, model: Model, sd: Floats) -> tuple[list[Log], Maximum]:
+    """The logs on the rows of estimation, for a camera's latency [s], and the posterior's maximum on them."""
+    rows = [prepare(each, latency) for each in logs]
+    return rows, _maximise(rows, model, sd)
+
+
+def _estimate(name: str, best: Maximum, model: Model, sd: Floats, interval: float) -> Estimate:
+    """Estimate of one number at the maximum, from a log with rows every ``interval`` [s]."""
+    usual = model.value(name, LAM if name == "lam" else 0.0)
+    if name not in model.names:
+        return Estimate(name, usual, usual, usual, usual, 1.0, excited=False)
+    j = model.names.index(name)
+    deviation = min(best.sd[j], sd[j])  # WIDER is no reason to know less than before
+    low, value, high = (model.value(name, best.theta[j] + sign * 1.96 * deviation) for sign in (-1.0, 0.0, 1.0))
+    delay = name not in LAGS or np.subtract(*(_delay(best, model) * (1.0, 2.0))) > 0.5 * interval
+    return Estimate(name, usual, value, low, high, deviation / sd[j], trusted=bool(delay))
 
 
 def _maximise(logs: Sequence[Log], model: Model, sd: Floats) -> Maximum:

@@ -4,7 +4,7 @@ import json
 import re
 
 from cz_gym.physics.parameters import MACHINE
-from cz_gym.puller.file import FOLDER, defaults_of, from_toml, to_toml, value_of
+from cz_gym.puller.file import FOLDER, PullerFile, defaults_of, from_toml, to_toml, value_of
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import PERCENT
 
@@ -25,33 +25,40 @@ def puller_text(identified: Identified, source: str, name: str) -> str:
     """
     start, puller = identified.start, identified.puller
     shipped = start.file is None or start.file.parent == FOLDER
-    kept = to_toml(start)
+    lines = [line for line in _text_of(start).splitlines() if not line.startswith(f"# {MARK}")]
+    tables = _tables([line for line in lines if not (shipped and line[:1] == "#")])
+    values = {found["key"]: found["value"] for line in to_toml(puller).splitlines() if (found := LINE.match(line))}
+    marks, defaults = _marks(identified), {} if start.file is None else defaults_of(start)
+    for quantity in MACHINE.values():
+        changed = value_of(puller, quantity) != value_of(start, quantity)
+        body, mark = tables.setdefault(quantity.table, []), marks.get(quantity.symbol, "")
+        _write_number(body, quantity.key, values.get(quantity.key), mark, changed, quantity.key in defaults)
+    text = _joined(tables, source, name if shipped else start.name)
+    return text if _same(text, puller.hash) else to_toml(puller)
+
+
+def _text_of(start: PullerFile) -> str:
+    """Text of the start file as its author wrote it, where it is still the same puller."""
     if start.file is not None and start.file.is_file():
         text = start.file.read_text("utf-8-sig")
         if _same(text, start.hash):
-            kept = text
-    lines = [line for line in kept.splitlines() if not (line.startswith(f"# {MARK}") or (shipped and line[:1] == "#"))]
-    values = dict(_numbers(to_toml(puller)))
-    marks, tables = _marks(identified), _tables(lines)
-    defaults = {} if start.file is None else defaults_of(start)
-    for table in dict.fromkeys(each.table for each in MACHINE.values()):
-        body = tables.setdefault(table, [])
-        places = {found["key"]: (at, found) for at, line in enumerate(body) if (found := LINE.match(line))}
-        for quantity in (each for each in MACHINE.values() if each.table == table):
-            mark, value = marks.get(quantity.symbol, ""), values.get(quantity.key)
-            changed = value_of(puller, quantity) != value_of(start, quantity)
-            at, found = places.get(quantity.key, (0, None))
-            if found and (changed or mark):
-                comment = re.sub(rf"(;\s*)?{MARK}.*$", "", found["comment"] or "")
-                said = "; ".join(each for each in (comment, MARK + mark if mark else "") if each)
-                body[at] = f"{quantity.key} = {value if changed else found['value']}" + (f" # {said}" if said else "")
-            elif not found and changed:
-                body.append(f"{quantity.key} = {value} # {MARK}{mark}")
-            elif not found and quantity.key in defaults:
-                said = f"default, nobody has said it{f'; {mark}' if mark else ''}"
-                body.append(f"# {MARK}{quantity.key} = {value} ({said})")
-    text = _joined(tables, source, name if shipped else start.name)
-    return text if _same(text, puller.hash) else to_toml(puller)
+            return text
+    return to_toml(start)
+
+
+def _write_number(body: list[str], key: str, value: str | None, mark: str, changed: bool, default: bool) -> None:
+    """Write a number with its mark into the lines of its table: in its place, or at the end if the file lacks it."""
+    places = {found["key"]: (at, found) for at, line in enumerate(body) if (found := LINE.match(line))}
+    at, found = places.get(key, (0, None))
+    if not found:
+        if changed:
+            body.append(f"{key} = {value} # {MARK}{mark}")
+        elif default:
+            body.append(f"# {MARK}{key} = {value} (default, nobody has said it{f'; {mark}' if mark else ''})")
+    elif changed or mark:
+        comment = re.sub(rf"(;\s*)?{MARK}.*$", "", found["comment"] or "")
+        said = "; ".join(each for each in (comment, MARK + mark if mark else "") if each)
+        body[at] = f"{key} = {value if changed else found['value']}" + (f" # {said}" if said else "")
 
 
 def _same(text: str, wanted: str) -> bool:
@@ -59,10 +66,6 @@ def _same(text: str, wanted: str) -> bool:
         return from_toml(text).hash == wanted
     except CzError:
         return False
-
-
-def _numbers(text: str) -> list[tuple[str, str]]:
-    return [(found["key"], found["value"]) for line in text.splitlines() if (found := LINE.match(line))]
 
 
 def _tables(lines: list[str]) -> dict[str, list[str]]:

@@ -121,13 +121,11 @@ def crystal(benchmark: Benchmark) -> go.Figure:
 
 def _draw(figure: go.Figure, scenario: int, benchmark: Benchmark, case: Case) -> dict[str, Any]:
     """Add the lines of a scenario and return the ranges of its panels: those of the crystals that were not lost."""
-    task, styles = task_of(case), styles_of(benchmark.contenders)
-    names = [each.name for each in chosen(benchmark, case, COLUMNS)]
-    fates = {name: lost(benchmark, case, name) for name in names}
-    whole = [name for name in names if not fates[name]] or names
+    task, names = task_of(case), [each.name for each in chosen(benchmark, case, COLUMNS)]
+    whole = [name for name in names if not lost(benchmark, case, name)] or names
     signals = {name: benchmark.signals[case.name, name] for name in names}
     longest = max(signals.values(), key=lambda each: len(each.r_c))
-    bias = 0.0 if task.by_length else ring_bias(case, benchmark.seeds(case)[0])
+    bias = ring_bias(case, benchmark.seeds(case)[0])
     step = max(round(POINT / case.control_interval), 1)
     minutes = step * case.control_interval / MINUTE
     layout: dict[str, Any] = {}
@@ -138,10 +136,7 @@ def _draw(figure: go.Figure, scenario: int, benchmark: Benchmark, case: Case) ->
             values = _points(panel.lines[line](logged, bias) / panel.scale, step)
             look = {"name": line, "legendgroup": line, **_DRAWN["shared"]}
             if own:
-                rmse = f": {benchmark.values(case, name, RMSE.metric)[0, 0]:.3f} mm{', lost' * fates[name]}"
-                title = plain(name) + rmse * (titled := not number and line == "true")
-                look = {"name": title, "showlegend": titled, "legendgroup": name, **_DRAWN[line]}
-                look["line"] = {**look["line"], "color": styles[name].colour}
+                look = _own_look(benchmark, case, name, line, number)
             if task.by_length:
                 look["x"] = _points(logged.L / MM, step)[: len(values)]
             else:
@@ -162,6 +157,14 @@ _DRAWN: dict[str, dict[str, Any]] = {
 """Style of a line; those that are drawn for each controller have its colour."""
 
 
+def _own_look(benchmark: Benchmark, case: Case, name: str, line: str, panel: int) -> dict[str, Any]:
+    """Style of a controller's line, and its name in the legend, which the first panel's true radius shows."""
+    titled = line == "true" and not panel
+    rmse = f": {benchmark.values(case, name, RMSE.metric)[0, 0]:.3f} mm{', lost' * lost(benchmark, case, name)}"
+    look = {"name": plain(name) + rmse * titled, "showlegend": titled, "legendgroup": name, **_DRAWN[line]}
+    return look | {"line": {**_DRAWN[line]["line"], "color": styles_of(benchmark.contenders)[name].colour}}
+
+
 def _lines(panel: Panel, names: Sequence[str]) -> list[tuple[str, str, bool]]:
     """Lines of a panel: name, controller, and whether each controller has one; else it is drawn once."""
     return [(line, name, line in OWN) for line in panel.lines for name in (names if line in OWN else names[:1])]
@@ -176,7 +179,12 @@ def _points(values: Floats, step: int) -> npt.NDArray[np.float32]:
 
 
 def ring_bias(case: Case, seed: int) -> float:
-    """Return the operator's bias of a seed's puller [m]: bright ring less radius at its own steady state."""
+    """Return the operator's bias of a seed's puller [m]: bright ring less radius at its own steady state.
+
+    Zero for a whole crystal, which has no steady state.
+    """
+    if task_of(case).by_length:
+        return 0.0
     env = CzEnv.from_config(case.config())
     env.reset(seed=seed)
     return float(env.get_state().slot.slot["puller"]["ring_bias"])
