@@ -30,6 +30,7 @@ from .model import (
     Model,
     NoiseLevels,
     Predicted,
+    melt_from_start,
     sensitivities,
     smooth,
 )  # fmt: skip
@@ -132,14 +133,19 @@ class Identified:
     def series(self, meniscus: MeniscusModel = HURLE) -> list[tuple[Floats, Floats, Floats]]:
         """Times [s], load on the melt [W] and fluctuation of the interface [K] of each log, from a smoother.
 
-        With them a crystal of :attr:`puller` grows as the log's did.
+        With them a crystal of :attr:`puller` grows as the log's did. A simulated crystal starts at rest: so the load
+        counts from the first row, as nominal power and temperatures do, and the fluctuation holds what the melt's
+        temperature differs because the log's temperatures were not at rest there.
         """
         lags = _lags_of(self.puller, False)
         model = Model(NoiseLevels._fields, self.puller.parameters, meniscus, lags)
         theta = np.array([np.log(each.value / each.prior) for each in self.noise])
-        states = [smooth(log, model, theta) for log in self.logs]
-        pairs = zip(self.logs, states, strict=True)
-        return [(log.time - log.time[0], each[:, LOAD], each[:, FAST] + each[:, SLOW]) for log, each in pairs]
+        pairs = []
+        for log in self.logs:
+            states = smooth(log, model, theta)
+            fluctuation = states[:, FAST] + states[:, SLOW] + melt_from_start(log, model, theta, states[0])
+            pairs.append((log.time - log.time[0], states[:, LOAD] - states[0, LOAD], fluctuation))
+        return pairs
 
     @property
     def puller(self) -> PullerFile:

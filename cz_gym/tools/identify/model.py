@@ -203,7 +203,7 @@ def predict(log: Log, model: Model, theta: Any) -> Predicted:
     start_sd = {FAST: noise.fast_sd, SLOW: noise.slow_sd, RATE: noise.load_rate * through}
     for state, sd in (*enumerate(START_SD), *start_sd.items(), (PYROMETER, OFFSET_SD[0]), (RING, OFFSET_SD[1])):
         P[state, state] = sd**2
-    warmer = p.T_1_0**3 / (p.T_2_0**3 + p.G_2b / (4.0 * p.kappa_12))
+    warmer = _susceptor_per_heater(p)
     drift = DRIFT_SD * np.array([0.0, 0.0, 1.0, warmer, 0.0, 0.0, 0.0, -p.G_2b * warmer, *[0.0] * 4])
     P = P + np.outer(drift, drift)
     z[SHOWN], P[SHOWN], P[:, SHOWN] = z[2], P[2], P[:, 2]
@@ -288,3 +288,23 @@ def smooth(log: Log, model: Model, theta: Floats) -> Floats:
         inverse = np.linalg.pinv(ahead / np.outer(sd, sd), hermitian=True) / np.outer(sd, sd)
         states[k] += out.covariance[k] @ A.T @ inverse @ (states[k + 1] - out.before[k + 1])
     return states
+
+
+def melt_from_start(log: Log, model: Model, theta: Floats, start: Floats) -> Floats:
+    """Deviation of T_b [K] at each row, shape (rows,), that is left of temperatures not at rest in the state ``start``.
+
+    At rest, the susceptor is warmer by what the load takes away, and the heater with it.
+    """
+    p, thermal = model.puller(np.asarray(theta, np.complex128)), slice(2, 5)
+    A = _sampled(p, model.noises(theta), np.complex128(QUICKEST), log.interval, model.meniscus)[0].real
+    susceptor = -start[LOAD] / p.G_2b.real
+    rest = np.array([susceptor / _susceptor_per_heater(p).real, susceptor, 0.0])
+    deviation, melt = start[thermal] - np.real(p.state_0[thermal]) - rest, np.empty(len(log.time))
+    for k in range(len(melt)):
+        melt[k], deviation = deviation[2], A[thermal, thermal] @ deviation
+    return melt
+
+
+def _susceptor_per_heater(p: Any) -> Any:
+    """Rise of T_2 per rise of T_1 at a constant T_b [K/K]."""
+    return p.T_1_0**3 / (p.T_2_0**3 + p.G_2b / (4.0 * p.kappa_12))
