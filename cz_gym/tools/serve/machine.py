@@ -36,7 +36,7 @@ from cz_gym.support.files import check_writable, name_file_in_errors, write_file
 from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN
 from cz_gym.tools.export.block import INPUTS, OUTPUTS, SETPOINT_NAMES, in_plant_units, settings_of
 from cz_gym.tools.export.controllers import FALLBACK, make_block
-from cz_gym.tools.identify.log import COLUMNS
+from cz_gym.tools.identify.log import RECORDED
 from cz_gym.tools.registry import make_controller
 
 SYNC = 0.5
@@ -77,9 +77,9 @@ class LogFile:
         """Write rows, each whole, and wait for the disk unless that was done within the last second."""
         if self._file < 0:
             self._open(os.O_APPEND | os.O_CREAT | os.O_EXCL)
-            self._write(",".join(COLUMNS))
+            self._write(",".join(RECORDED))
         for row in rows:
-            self._write(",".join(f"{float(row[name]):.10g}" for name in COLUMNS))
+            self._write(",".join(f"{float(row[name]):.10g}" for name in RECORDED))
         full = self._size >= self.largest
         if full or time.monotonic() >= self._synced + SYNC:
             os.fsync(self._file)
