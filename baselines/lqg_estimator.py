@@ -19,25 +19,9 @@ from cz_gym.support.errors import map_arrays, select
 from cz_gym.support.units import KILO, MINUTE
 
 from . import lqg_filter
-from .lqg_filter import (
-    DRIFT,
-    FAST,
-    HEATER,
-    PLANT,
-    RIPPLE,
-    RIPPLE_STATES,
-    SLOW,
-    STATES,
-    NoiseModel,
-    PlantModel,
-    RingModel,
-    RippleSearch,
-    augmented,
-    plant_model,
-)
 from .policy import Floats
 
-_RADIUS, _HEIGHT, _PYROMETER = (STATES.index(name) for name in ("r_c", "h_c", "T_1"))
+_RADIUS, _HEIGHT, _PYROMETER = (lqg_filter.STATES.index(name) for name in ("r_c", "h_c", "T_1"))
 _LARGEST = np.array([np.inf, 1.0, 50.0, 50.0, 50.0, 5.0, 5.0, 30.0, 1.0 / MINUTE, 5.0 * KILO])
 """Limits of the estimates, SI units; beyond them the equations are meaningless. Radius and height have the puller's."""
 _INSIDE = 0.9
@@ -54,7 +38,7 @@ class FilterState(NamedTuple):
     """Covariance of the estimate, shape (n, states, states)."""
     camera_variance: Floats
     """Estimated variance of the camera's noise [m2], shape (n,)."""
-    ripple: RippleSearch
+    ripple: lqg_filter.RippleSearch
     surprise: Floats
     """Running means of the innovations of pyrometer and ring, in standard deviations, shape (n, 2)."""
 
@@ -67,16 +51,16 @@ class PlantFilter(NamedTuple):
     """The filter of one puller, or of one a slot: then ``puller`` and ``plant`` have a leading axis n."""
 
     puller: Any
-    plant: PlantModel
+    plant: lqg_filter.PlantModel
     """The linear model, augmented if ``ring`` is given."""
-    noise: NoiseModel
+    noise: lqg_filter.NoiseModel
     meniscus: MeniscusModel
     dt: float
     """Control interval [s]."""
     nonlinear: bool
     gate: float
     """Limit of the innovations, in standard deviations [-]."""
-    ring: RingModel | None = None
+    ring: lqg_filter.RingModel | None = None
 
     def at_rest(self, n: int) -> FilterState:
         """The state before the first sample of n slots."""
@@ -98,12 +82,12 @@ class PlantFilter(NamedTuple):
         """The state one interval later, under applied inputs [m/s, W], (n, 2), and a known step of the drift [K]."""
         mean = (self.plant.A @ state.mean[..., None] + self.plant.B @ applied[..., None])[..., 0]
         if self.nonlinear:
-            mean[:, :PLANT] = self._moved_plant(state.mean, applied)
-        mean[:, DRIFT] += drift_moved
+            mean[:, : lqg_filter.PLANT] = self._moved_plant(state.mean, applied)
+        mean[:, lqg_filter.DRIFT] += drift_moved
         if self.ring is None:
             covariance = self.plant.A @ state.covariance @ np.swapaxes(self.plant.A, -1, -2) + self.plant.Q
         else:
-            mean[:, RIPPLE:], covariance = self._moved_ring(state, self.ring)
+            mean[:, lqg_filter.RIPPLE :], covariance = self._moved_ring(state, self.ring)
         return state._replace(mean=self._clipped(mean), covariance=covariance)
 
     def correct(self, state: FilterState, seen: Measured) -> FilterState:
@@ -136,7 +120,7 @@ class PlantFilter(NamedTuple):
         if self.ring is None or not state.ripple.spectrum.shape[1]:
             return new
         limit = gate * np.sqrt(expected + state.camera_variance)
-        residual = np.clip(innovation, -limit, limit) + mean[:, RIPPLE]
+        residual = np.clip(innovation, -limit, limit) + mean[:, lqg_filter.RIPPLE]
         return self._search_ripple(new, residual, valid, self.ring)
 
     def expected_frame(self, mean: Floats) -> tuple[Floats, Floats]:
@@ -147,7 +131,9 @@ class PlantFilter(NamedTuple):
         delivered = lqg_filter.delivered_row(row, self.ring, self.dt)
         samples, oldest = self.ring.delay(self.dt)
         newest = (1.0, 1.0 - oldest, 0.0)[min(samples, 2)]
-        return newest * now + np.einsum("ni,ni->n", mean[:, RIPPLE:], delivered[:, RIPPLE:]), delivered
+        return newest * now + np.einsum(
+            "ni,ni->n", mean[:, lqg_filter.RIPPLE :], delivered[:, lqg_filter.RIPPLE :]
+        ), delivered
 
     def _expected_ring(self, mean: Floats) -> tuple[Floats, Floats]:
         """The present ring minus its nominal [m], shape (n,), and its derivative by the state, shape (n, states)."""
@@ -165,13 +151,13 @@ class PlantFilter(NamedTuple):
 
     def _moved_plant(self, mean: Floats, applied: Floats) -> Floats:
         p, z = self.puller, mean.T
-        x = State(*(value + nominal for value, nominal in zip(z[:PLANT], p.state_0, strict=True)))
-        u = Inputs(p.v_0 + applied[:, 0], p.Q_H_0 + applied[:, 1] + z[HEATER])
-        d = Disturbance(hidden_load(z[DRIFT], p), z[FAST] + z[SLOW], 1.0)
+        x = State(*(value + nominal for value, nominal in zip(z[: lqg_filter.PLANT], p.state_0, strict=True)))
+        u = Inputs(p.v_0 + applied[:, 0], p.Q_H_0 + applied[:, 1] + z[lqg_filter.HEATER])
+        d = Disturbance(hidden_load(z[lqg_filter.DRIFT], p), z[lqg_filter.FAST] + z[lqg_filter.SLOW], 1.0)
         new = rk4(x, u, d, p, self.dt, self.meniscus.slope)
         return np.stack([value - nominal for value, nominal in zip(new, p.state_0, strict=True)], axis=-1)
 
-    def _moved_ring(self, state: FilterState, ring: RingModel) -> tuple[Floats, Floats]:
+    def _moved_ring(self, state: FilterState, ring: lqg_filter.RingModel) -> tuple[Floats, Floats]:
         """Ripple and past rings one interval later, shape (n, states - 10), and the covariance of all states."""
         now, row = self._expected_ring(state.mean)
         A = lqg_filter.transition(self.plant.A, row, state.ripple.omega, ring, self.dt)
@@ -181,18 +167,18 @@ class PlantFilter(NamedTuple):
         covariance = A @ state.covariance @ np.swapaxes(A, -1, -2) + self.plant.Q
         if ring.has_ripple:
             covariance = _without_ripple(covariance, state.ripple.omega == 0.0)
-        return mean[:, RIPPLE:], covariance
+        return mean[:, lqg_filter.RIPPLE :], covariance
 
     def _search_ripple(
-        self, state: FilterState, residual: Floats, valid: npt.NDArray[np.bool_], ring: RingModel
+        self, state: FilterState, residual: Floats, valid: npt.NDArray[np.bool_], ring: lqg_filter.RingModel
     ) -> FilterState:
         """One more sample of the search for the ripple's frequency; slots that find it begin to estimate the ripple."""
         search, new, ripple = lqg_filter.search_step(state.ripple, residual, valid, ring, self.dt)
         if not new.any():
             return state._replace(ripple=search)
         mean, covariance = state.mean.copy(), _without_ripple(state.covariance, new)
-        mean[new, RIPPLE_STATES] = ripple[new]
-        covariance[new, RIPPLE_STATES, RIPPLE_STATES] = ring.ripple_sd**2 * np.eye(2)
+        mean[new, lqg_filter.RIPPLE_STATES] = ripple[new]
+        covariance[new, lqg_filter.RIPPLE_STATES, lqg_filter.RIPPLE_STATES] = ring.ripple_sd**2 * np.eye(2)
         least = self.noise.camera_sd_range[0] ** 2
         reduced = np.maximum(state.camera_variance - 0.5 * np.square(ripple).sum(axis=1), least)
         variance = np.where(new, reduced, state.camera_variance)
@@ -203,7 +189,7 @@ class PlantFilter(NamedTuple):
         if not self.nonlinear:
             return mean
         p, clipped = self.puller, mean.copy()
-        clipped[:, : len(STATES)] = np.clip(mean[:, : len(STATES)], -_LARGEST, _LARGEST)
+        clipped[:, : len(lqg_filter.STATES)] = np.clip(mean[:, : len(lqg_filter.STATES)], -_LARGEST, _LARGEST)
         lowest, highest = _INSIDE * (HEIGHT_MIN - p.h_0), _INSIDE * (HEIGHT_MAX_IN_A * p.a - p.h_0)
         clipped[:, _HEIGHT] = np.clip(mean[:, _HEIGHT], lowest, highest)
         clipped[:, _RADIUS] = np.clip(mean[:, _RADIUS], -radius_limit(p.r_0), radius_limit(p.r_0))
@@ -215,8 +201,8 @@ def _without_ripple(covariance: Floats, where: npt.NDArray[np.bool_]) -> Floats:
     if not where.any():
         return covariance
     reduced = covariance.copy()
-    reduced[where, RIPPLE_STATES] = 0.0
-    reduced[where, :, RIPPLE_STATES] = 0.0
+    reduced[where, lqg_filter.RIPPLE_STATES] = 0.0
+    reduced[where, :, lqg_filter.RIPPLE_STATES] = 0.0
     return reduced
 
 
@@ -307,8 +293,8 @@ def multiple_model_filter(single: PlantFilter, hypotheses: Hypotheses, n: int) -
     models = []
     for fast, slow in product(hypotheses.fast_sd, hypotheses.slow_sd):
         noise = replace(single.noise, fast_sd=fast, slow_sd=slow)
-        model = plant_model(single.puller, noise, single.dt, single.meniscus)
-        models.append(model if single.ring is None else augmented(model, single.ring, single.dt))
+        model = lqg_filter.plant_model(single.puller, noise, single.dt, single.meniscus)
+        models.append(model if single.ring is None else lqg_filter.augmented(model, single.ring, single.dt))
     Q, start = (np.tile([getattr(model, name) for model in models], (n, 1, 1)) for name in ("Q", "start"))
     return MultipleModelFilter(single._replace(plant=single.plant._replace(Q=Q, start=start)), hypotheses)
 

@@ -11,17 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.baselines.analysis import (
-    HOT_ZONE,
-    LinearForm,
-    close,
-    frequencies,
-    linear_form,
-    loop_margins,
-    opened,
-    response,
-    stable_range,
-)
+from cz_gym.baselines import analysis
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import user_controller
 from cz_gym.physics.plant import make_puller
@@ -38,12 +28,12 @@ PLACES = {"camera": "ring", "v_p": "pull speed", "Q_H": "heater"}
 """Names of the places where the loop is opened."""
 
 
-def form_of(name: str, puller: PullerFile = DEFAULT) -> LinearForm:
+def form_of(name: str, puller: PullerFile = DEFAULT) -> analysis.LinearForm:
     """Linearise a shipped controller, or ``FILE.py:NAME``; ValueError says in one line why it has no linear form."""
     config = make_config("nominal", observation="measured", action="direct", puller=puller)
     sensor = make_config("randomized", puller=puller).sole_scenario.sensor
     policy = user_controller(name).make(config) if ":" in name else make_controller(name, config)
-    return linear_form(policy, sensor)
+    return analysis.linear_form(policy, sensor)
 
 
 def phase_of(values: Any) -> Any:
@@ -56,11 +46,11 @@ def picture(name: str, dt: float, loops: dict[str, StateSpace]) -> bytes:
     """Draw gain and phase of the loops, by the place where they are opened, and their sensitivity, as PNG."""
     from cz_gym.evaluation.plots import COLOURS, GREY, canvas, png
 
-    omega = frequencies(dt)
+    omega = analysis.frequencies(dt)
     figure = canvas(7.0, 6.5)
     gain, phase, sensitivity = figure.subplots(3, 1, sharex=True)
     for (at, loop), colour in zip(loops.items(), COLOURS, strict=False):
-        values = response(loop, dt, omega)
+        values = analysis.response(loop, dt, omega)
         gain.loglog(omega, np.abs(values), color=colour, lw=1.2, label=f"opened at the {PLACES[at]}")
         phase.semilogx(omega, phase_of(values), color=colour, lw=1.2)
         sensitivity.loglog(omega, 1.0 / np.abs(1.0 + values), color=colour, lw=1.2)
@@ -90,19 +80,20 @@ def _main(given: argparse.Namespace) -> None:
     own = chosen_puller(given.puller)
     form, puller = form_of(given.controller, own), make_puller(own.parameters, given.mix)
     heats = form.controller.C[1].any() or form.controller.D[1].any()
-    stable = close(form.controller, puller, form.dt).stable
+    stable = analysis.close(form.controller, puller, form.dt).stable
     heads = ("opened at", "crossover [rad/s]", "gain up", "gain down", "phase [deg]", "delay [s]", "sensitivity")
     rows, loops = [], {}
     for at in PLACES if heats else ("camera", "v_p"):
         controller = form.controller if at == "camera" else form.free
-        first, *rest = loop_margins(controller, puller, form.dt, at, stable)
+        first, *rest = analysis.loop_margins(controller, puller, form.dt, at, stable)
         rows.append((PLACES[at], f"{first:.2e}", *("none" if np.isnan(value) else f"{value:.3g}" for value in rest)))
-        loops[at] = opened(controller, puller, form.dt, at)
+        loops[at] = analysis.opened(controller, puller, form.dt, at)
     print(table(heads, rows))
     if not stable:
         print("the closed loop is unstable: it has no margins")
     ranges = {
-        name: stable_range(form.controller, form.dt, of, given.mix, own.parameters) for name, of in HOT_ZONE.items()
+        name: analysis.stable_range(form.controller, form.dt, of, given.mix, own.parameters)
+        for name, of in analysis.HOT_ZONE.items()
     }
     zones = [(name, f"{low:.2f}", f"{high:.2f}") for name, (low, high) in ranges.items()]
     print(table(("factor on", "stable from", "to"), zones))

@@ -13,17 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from cz_gym.agents import OnnxPolicy
-from cz_gym.evaluation.protocol import (
-    CASES,
-    GROUPS,
-    PLANT,
-    REWARD,
-    STATE,
-    TEST_SEEDS,
-    Case,
-    Contender,
-    agent,
-)
+from cz_gym.evaluation import protocol
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import check_writable, name_file_in_errors, write_files
@@ -42,35 +32,39 @@ BUDGETS = {"1 M": 1_000_000, "5 M": 5_000_000, "20 M": 20_000_000}
 OVERSHOOT = 1.05
 """Share of a budget that a training may take: it ends with an update, which may end later."""
 HEADS = ("budget", "place", "agent", "told", "training seeds", "claimed RMSE [mm]", "here", "lost here [%]", "contract")
-TOLD = {GROUPS[REWARD]: "nothing", GROUPS[STATE]: "state, in training", GROUPS[PLANT]: "plant, in training"}
+TOLD = {
+    protocol.GROUPS[protocol.REWARD]: "nothing",
+    protocol.GROUPS[protocol.STATE]: "state, in training",
+    protocol.GROUPS[protocol.PLANT]: "plant, in training",
+}
 """What an agent was told, by the heading of its group."""
 Claims = Mapping[str, tuple[float, str]]
 """RMSE [mm] on the first case, and the contract, that each submission claims."""
 
 
-def random_cases(first_seed: int) -> list[Case]:
+def random_cases(first_seed: int) -> list[protocol.Case]:
     """The benchmark's cases of several crystals, from this seed on."""
-    random = (case for case in CASES if case.default and not case.deterministic)
+    random = (case for case in protocol.CASES if case.default and not case.deterministic)
     return [replace(case, first_seed=first_seed) for case in random]
 
 
-def budget(contender: Contender) -> str:
+def budget(contender: protocol.Contender) -> str:
     """The smallest budget that the trainings of an agent keep."""
     steps = max(policy.contract.training_steps for policy in contender.trained)
     return next((name for name, most in BUDGETS.items() if steps <= OVERSHOOT * most), "open")
 
 
-def submission(folder: Path) -> tuple[Contender, tuple[float, str]]:
+def submission(folder: Path) -> tuple[protocol.Contender, tuple[float, str]]:
     """The agent of a folder, and its claim: RMSE on test crystals of the first case, and contract."""
     files = sorted(folder.glob("*.onnx"))
     if not files:
         raise CzError(f"{folder}: no agent file (*.onnx)")
     claimed = folder / "benchmark.json"
     estimates, contract = read_estimates(claimed, [RMSE.metric])
-    claim = by_key(estimates).get((CASES[0].name, folder.name, RMSE.metric, "mean"))
+    claim = by_key(estimates).get((protocol.CASES[0].name, folder.name, RMSE.metric, "mean"))
     if claim is None:
-        raise CzError(f"{claimed}: no results of {folder.name!r} on {CASES[0].name}")
-    contender = agent(folder.name, [OnnxPolicy.load(file) for file in files], own=True)
+        raise CzError(f"{claimed}: no results of {folder.name!r} on {protocol.CASES[0].name}")
+    contender = protocol.agent(folder.name, [OnnxPolicy.load(file) for file in files], own=True)
     return contender, (claim.mean, contract)
 
 
@@ -105,9 +99,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = OneLineParser("python -m studies.leaderboard", (__doc__ or "").split("\n")[0])
     parser.add_argument("folder", type=Path, help="folder of the submissions, a folder each")
     about = "fresh crystals a scenario (default: %(default)s)"
-    parser.add_argument("--episodes", type=between(2, len(TEST_SEEDS)), default=100, help=about)
+    parser.add_argument("--episodes", type=between(2, len(protocol.TEST_SEEDS)), default=100, help=about)
     about = "seed of the first crystal (default: a random one, which the page names)"
-    parser.add_argument("--first-seed", type=between(FRESH.start, FRESH.stop - len(TEST_SEEDS)), help=about)
+    parser.add_argument("--first-seed", type=between(FRESH.start, FRESH.stop - len(protocol.TEST_SEEDS)), help=about)
     about = "folder for leaderboard.md and leaderboard.json (default: %(default)s)"
     parser.add_argument("--out", type=Path, default=Path("runs/leaderboard"), help=about)
     return parser.run(_main, arguments, "benchmark")
@@ -119,7 +113,7 @@ def _main(given: argparse.Namespace) -> None:
         submitted = [submission(each) for each in sorted(given.folder.iterdir()) if each.is_dir()]
     if not submitted:
         raise CzError(f"{given.folder}: no submissions: each is a folder with agent files and benchmark.json")
-    first = given.first_seed or FRESH[secrets.randbelow(len(FRESH) - len(TEST_SEEDS))]
+    first = given.first_seed or FRESH[secrets.randbelow(len(FRESH) - len(protocol.TEST_SEEDS))]
     cases = random_cases(first)
     agents = [contender for contender, _ in submitted]
     check_agents(agents, cases)

@@ -25,7 +25,7 @@ from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import MINUTE
 
-from .registry import TASKS, find_controller
+from .registry import find_controller
 
 Action = npt.NDArray[np.float32]
 SIZE = (960, 720)
@@ -33,6 +33,8 @@ SIZE = (960, 720)
 NO_DISPLAY = "no display: a crystal is pulled by hand in a window; set DISPLAY or WAYLAND_DISPLAY"
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
 """Environment variables that can name a display, on systems that have such."""
+RIVALS = {BODY.name: ("paper", "the paper's"), CRYSTAL.name: ("compensated", "the compensated")}
+"""Controller that a player is compared with by environment: its name, and what a sentence calls it."""
 STEP = 0.1
 """Action of a key that is held down, in the mode "rate"; ten times as large with shift [-]."""
 
@@ -79,15 +81,15 @@ def score(config: Config, seed: int, actions: Sequence[Action], failed: bool) ->
     if not failed:
         config = replace(config, horizon=len(actions) * config.control_interval)
     direct = replace(config, action="direct")
-    task = TASKS[config.process.name]
-    rival = find_controller(task.rival, config.process).make(direct)
+    name, called = RIVALS[config.process.name]
+    rival = find_controller(name, config.process).make(direct)
     results = []
     for policy, own in ((Playback(actions), config), (rival, direct)):
         figures = metrics(rollout(policy, own, [seed]))
         lost = ", failed" if figures.failure_rate[0] else ""
         results.append(f"RMSE {figures.rmse_mm[0]:.3f} mm, return {figures.return_[0]:,.0f}{lost}")
     crystal = f"{config.scenario.name}, crystal {seed}, {config.horizon / MINUTE:.0f} min"
-    return f"{crystal}: by hand {results[0]}; by {task.rival_meaning} controller {results[1]}"
+    return f"{crystal}: by hand {results[0]}; by {called} controller {results[1]}"
 
 
 def _play(arguments: argparse.Namespace) -> None:

@@ -2,26 +2,14 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
+from cz_gym.baselines import tuned_controllers as tuned
 from cz_gym.baselines.clairvoyant import Clairvoyant
-from cz_gym.baselines.lqg import LQG, LQGDesign
-from cz_gym.baselines.lqg_bounds import full_information, privileged
+from cz_gym.baselines.lqg import LQG, LQGDesign, full_information, privileged
 from cz_gym.baselines.pid import CompensatedPID
 from cz_gym.baselines.policy import OpenLoop, Policy
 from cz_gym.baselines.scaling import scale_crystal
 from cz_gym.baselines.tuned import TunedController
-from cz_gym.baselines.tuned_controllers import (
-    BEST_RETURN,
-    CRYSTALS,
-    FILTER,
-    LQGS,
-    PIDS,
-    RING_PID,
-    TRUE_PID,
-    adaptive,
-    paper_here,
-)
 from cz_gym.body.process import BODY
 from cz_gym.config import Config, check_config
 from cz_gym.crystal.process import CRYSTAL
@@ -30,17 +18,17 @@ from cz_gym.process import Process
 from cz_gym.support.errors import CzError, unknown_name_message
 
 
-def _changed(change: Callable[[LQG], Policy], tuned: TunedController, config: Config) -> Policy:
-    return change(tuned.make(config))
+def _changed(change: Callable[[LQG], Policy], record: TunedController, config: Config) -> Policy:
+    return change(record.make(config))
 
 
 def _designed(make: Callable[[LQGDesign, Config], Policy], config: Config) -> Policy:
-    return make(BEST_RETURN.settings(config.sole_scenario), config)
+    return make(tuned.BEST_RETURN.settings(config.sole_scenario), config)
 
 
 _measured = partial(Contender, observation="measured")
 _bound = partial(Contender, default=False, privileged=True)
-_QUIET, _CALM, _IN_TABLE = (each for each in LQGS if each.name in ("lqg-quiet", "lqg-at-0.013", FILTER))
+_QUIET, _CALM, _IN_TABLE = (each for each in tuned.LQGS if each.name in ("lqg-quiet", "lqg-at-0.013", tuned.FILTER))
 CONTROLLERS: tuple[Contender, ...] = (
     _measured("open-loop", partial(unchanged, OpenLoop()), meaning="nominal pull speed and heater power, no feedback"),
     _measured(
@@ -52,7 +40,7 @@ CONTROLLERS: tuple[Contender, ...] = (
     ),
     _measured(
         "paper-here",
-        paper_here,
+        tuned.paper_here,
         meaning="the paper's compensator and PID, designed by its procedure for this puller",
         default=False,
         on_puller=True,
@@ -62,11 +50,11 @@ CONTROLLERS: tuple[Contender, ...] = (
         CompensatedPID(compensator=None).for_config,
         meaning="the same PID without the compensator: unstable",
     ),
-    *(each.contender for each in (*PIDS, *LQGS)),
+    *(each.contender for each in (*tuned.PIDS, *tuned.LQGS)),
     *(
         _measured(
             f"{each.name}-adaptive",
-            partial(_changed, adaptive, each),
+            partial(_changed, tuned.adaptive, each),
             meaning=f"{each.name} with filters for weaker fluctuations too, weighted by how well they predict",
             default=each.default,
         )
@@ -74,7 +62,7 @@ CONTROLLERS: tuple[Contender, ...] = (
     ),
     _bound(
         "lqg-true",
-        partial(_changed, partial(privileged, knows_fluctuations=False), BEST_RETURN),
+        partial(_changed, partial(privileged, knows_fluctuations=False), tuned.BEST_RETURN),
         "measured",
         "bound: lqg given the puller's parameters",
     ),
@@ -101,11 +89,16 @@ CONTROLLERS: tuple[Contender, ...] = (
 """Every named controller of ``Cz-v0``, in the order of tables."""
 CRYSTAL_CONTROLLERS: tuple[Contender, ...] = (
     Contender("recipe", partial(unchanged, OpenLoop()), "measured", "the recipe's pull speed and power, no feedback"),
-    Contender("ring-pid", partial(scale_crystal, RING_PID), "measured", "PID on the bright ring with the body's gains"),
-    *(each.contender for each in CRYSTALS),
+    Contender(
+        "ring-pid",
+        partial(scale_crystal, tuned.RING_PID),
+        "measured",
+        "PID on the bright ring with the body's gains",
+    ),
+    *(each.contender for each in tuned.CRYSTALS),
     Contender(
         "true-radius",
-        partial(scale_crystal, TRUE_PID),
+        partial(scale_crystal, tuned.TRUE_PID),
         "state",
         "bound: the PID on the true radius, which no sensor shows",
         privileged=True,
@@ -115,27 +108,13 @@ CRYSTAL_CONTROLLERS: tuple[Contender, ...] = (
 """Every named controller of ``CzCrystal-v0``, in the order of tables."""
 
 
-class TaskControllers(NamedTuple):
-    """Controllers of a task, and the one that a tool names by itself."""
-
-    known: tuple[Contender, ...]
-    """Every named controller, in the order of tables."""
-    rival: str
-    """Controller that a player is compared with."""
-    rival_meaning: str
-    """Name of the rival in a sentence."""
-
-
-TASKS = {
-    BODY.name: TaskControllers(CONTROLLERS, "paper", "the paper's"),
-    CRYSTAL.name: TaskControllers(CRYSTAL_CONTROLLERS, "compensated", "the compensated"),
-}
+KNOWN = {BODY.name: CONTROLLERS, CRYSTAL.name: CRYSTAL_CONTROLLERS}
 """Controllers by environment."""
 
 
 def find_controller(name: str, process: Process = BODY) -> Contender:
     """The controller of that name for a process; CzError lists the known ones for another name."""
-    known = TASKS.get(process.name, TASKS[BODY.name]).known
+    known = KNOWN.get(process.name, CONTROLLERS)
     for entry in known:
         if entry.name == name:
             return entry

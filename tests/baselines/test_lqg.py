@@ -1,4 +1,4 @@
-"""The LQG against the exact optimum and the nonlinear plant."""
+"""The LQG, adaptive and privileged ones too, against the exact optimum and the nonlinear plant."""
 
 from dataclasses import replace
 
@@ -7,21 +7,38 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
-from cz_gym import make_puller
-from cz_gym.baselines.lqg import LQG, PULL_SCALE, LQGDesign, look_ahead, quadratic_cost, regulator, samples_ahead, solve
-from cz_gym.baselines.lqg_bounds import privileged
+from cz_gym import CzVectorEnv, make_puller
+from cz_gym.baselines.analysis import close, linear_form
+from cz_gym.baselines.clairvoyant import fluctuations_of, pullers_of
+from cz_gym.baselines.lqg import (
+    LQG,
+    PULL_SCALE,
+    LQGDesign,
+    PrivilegedLQG,
+    look_ahead,
+    privileged,
+    quadratic_cost,
+    regulator,
+    samples_ahead,
+    solve,
+)
+from cz_gym.baselines.lqg_estimator import Hypotheses, multiple_model_filter
 from cz_gym.baselines.lqg_filter import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, RingModel, plant_model
-from cz_gym.baselines.tuned_controllers import FAMILY
+from cz_gym.baselines.tuned_controllers import FACTORS, FAMILY, adaptive
 from cz_gym.body.signals import Measured, Weights, coefficients
 from cz_gym.config import make_config
+from cz_gym.episodes.scenario import Interface
+from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.plant import Disturbance, State, hidden_load, quintic, rates
 from cz_gym.process import Inputs
 from cz_gym.puller.file import find_puller
+from cz_gym.spaces import decode
+from cz_gym.support.errors import map_arrays
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
-from cz_gym.tools.registry import CONTROLLERS, make_controller
-from tests.observed import PLAIN, measured
+from cz_gym.tools.registry import CONTROLLERS, find_controller, make_controller
+from tests.observed import PLAIN, Watched, measured, observations
 from tests.samples import NOMINAL_LQG
 
 PULLER = make_puller(lam=0.5)
@@ -240,7 +257,7 @@ def test_to_know_of_the_latency_costs_less_than_to_ignore_it():
 
 CRYSTALS = range(16)
 ADAPTIVE = [each.name for each in CONTROLLERS if each.name.endswith("-adaptive")]
-"""That each of their filters holds the slowest hot zones, ``test_lqg_estimator.py`` tests on the linear loop."""
+"""That each of their filters holds the slowest hot zones is tested on the linear loop below."""
 SLOW_CASES = [pytest.param(name, marks=pytest.mark.slow) for name in (*FAMILY[1:-1], *ADAPTIVE)]
 
 
@@ -264,3 +281,106 @@ def test_one_design_serves_every_scenario_and_loses_no_crystal():
     assert make_controller("lqg", configs[0]).design != make_controller("lqg", configs[1]).design
     for config in configs:
         assert not rollout(policies[0], config, CRYSTALS).failed.any()
+
+
+# Adaptive: with one hypothesis it is the LQG; with many it finds out how strong fluctuations are
+
+
+@pytest.mark.parametrize("scenario", ["sensor-fault", "puller"])
+def test_the_adaptive_lqg_with_one_hypothesis_is_the_lqg(scenario):
+    config = make_config(scenario, horizon=1800.0, **PLAIN)
+    plain = make_controller("lqg-at-0.02", config)
+    noise = plain.design.noise
+    one = replace(plain, hypotheses=Hypotheses((noise.fast_sd,), (noise.slow_sd,)))
+    ours, theirs = (rollout(each, config, range(4)) for each in (one, plain))
+    np.testing.assert_allclose(ours.signals.v_p, theirs.signals.v_p, rtol=1e-6)
+
+
+def test_the_bank_weights_its_filters_by_bayes_rule():
+    single, hypotheses = LQG(design=LQGDesign(nonlinear=False)).gains.filter, Hypotheses((0.05, 0.5), (0.3,))
+    bank = multiple_model_filter(single, hypotheses, 1)
+    state, evidence, row = bank.at_rest(1), np.zeros(2), single.plant.H[0]
+    random = np.random.default_rng(3)
+    for _ in range(5):
+        rows = bank.rows.predict(map_arrays(lambda part: part[0], state.filters), np.zeros((2, 2)), np.zeros(2))
+        seen = decode(measured(ring_error=random.normal() * 0.02 * MM))
+        for j in range(2):
+            variance = row @ rows.covariance[j] @ row + rows.camera_variance[j]
+            innovation = seen.ring_error[0] - row @ rows.mean[j]
+            evidence[j] += -0.5 * innovation**2 / variance - 0.5 * np.log(variance)
+        state = bank.step(state, np.zeros((1, 2)), np.zeros(1), seen, np.zeros(1, bool))
+    weight = np.exp(evidence - evidence.max())
+    assert state.probability[0] == pytest.approx(weight / weight.sum(), rel=1e-9)
+    assert state.mean[0] == pytest.approx(state.probability[0] @ state.filters.mean[0])
+
+
+@pytest.mark.parametrize(("strength", "factor"), [(0.05, 0.2), (0.5, 1.0)])
+def test_the_adaptive_lqg_estimates_how_strong_the_fluctuations_are(strength, factor):
+    """After an hour nine of ten crystals are at the nearest hypothesis; the design is that for known hot zones."""
+    config = make_config("randomized", horizon=HOUR, **PLAIN)
+    config = config.with_scenario(replace(config.scenario, name="one", interface=Interface(sd=(strength, strength))))
+    watched = Watched(adaptive(NOMINAL_LQG.for_config(config)), 1)
+    rollout(watched, config, range(20))
+    expected = watched.states[-1].memory.filter.probability @ np.repeat(FACTORS, len(FACTORS))
+    assert (np.abs(expected - factor) < 0.4).mean() >= 0.9
+
+
+def test_the_adaptive_lqg_holds_the_slowest_hot_zones():
+    """Two of 500 validation crystals, on which a filter that expects stronger slow fluctuations is unstable."""
+    config = make_config("hot-zone", **PLAIN)
+    plain, seeds = make_controller("lqg-at-0.02", config), (1_000_102, 1_000_275)
+    assert not rollout(adaptive(plain).for_config(config), config, seeds).failed.any()
+    noise = replace(plain.design.noise, slow_sd=2.0 * plain.design.noise.slow_sd)
+    form = linear_form(replace(plain, design=replace(plain.design, noise=noise)))
+    assert not any(close(form.controller, puller, form.dt).stable for puller in pullers_of(config, seeds))
+
+
+# Privileged: what they know is what the environment brings, and is worth something
+
+
+def test_the_bounds_know_the_pullers_and_fluctuations_that_the_environment_draws():
+    config, seeds = make_config("randomized", horizon=600.0, **PLAIN), (5, 9, 2_000_000)
+    env = CzVectorEnv(3, horizon=600.0, **PLAIN)
+    env.reset(seed=list(seeds))
+    slots = env._batch.memory.slots
+    for drawn, puller in zip(slots["puller"], pullers_of(config, seeds), strict=True):
+        np.testing.assert_allclose([drawn[name] for name in puller._fields], puller, rtol=1e-12)
+    drawn = np.stack([slots["episode"]["sd_fast"], slots["episode"]["sd_slow"]], axis=1)
+    np.testing.assert_array_equal(fluctuations_of(config, seeds), drawn)
+    assert len(np.unique(drawn)) == 6
+
+
+def test_each_filter_has_the_noise_of_its_own_crystal():
+    config = make_config("only-interface", horizon=900.0, **PLAIN)
+    bound = PrivilegedLQG(design=LQGDesign(lam=1.0), knows_fluctuations=True)
+    known = bound.for_episodes(config, np.arange(3)).gains.filter.plant.Q
+    for slot, (fast, slow) in enumerate(fluctuations_of(config, [0, 1, 2])):
+        noise = replace(LQGDesign().noise, fast_sd=fast, slow_sd=slow)
+        puller = pullers_of(config, [slot])[0]
+        np.testing.assert_allclose(known[slot], plant_model(puller, noise, config.control_interval).Q, rtol=1e-12)
+
+
+@pytest.mark.parametrize("names", [("lqg-at-0.02", "lqg-at-0.02-privileged"), ("lqg", "full-information")])
+def test_knowing_more_lowers_error_and_activity_on_the_same_episodes(names):
+    """The puller and its fluctuations, or the whole state."""
+    found = []
+    for entry in map(find_controller, names):
+        config = make_config("randomized", observation=entry.observation, action="direct", horizon=2.0 * HOUR)
+        found.append(metrics(rollout(entry.make(config), config, range(20))))
+    plain, privileged = found
+    assert privileged.rmse_mm.mean() < plain.rmse_mm.mean()
+    assert privileged.pull_step_rms_mm_per_min.mean() < plain.pull_step_rms_mm_per_min.mean()
+
+
+@pytest.mark.parametrize("error_pull", [None, 2e-7])
+def test_the_privileged_lqg_of_a_nominal_puller_is_the_lqg(error_pull):
+    """Also where a share of a narrow drive is left to the meniscus, which bounds on such pullers could not run with."""
+    design, config = LQGDesign(lam=1.0, error_pull=error_pull), make_config("only-interface", horizon=900.0, **PLAIN)
+    privileged, plain = (rollout(kind(design=design), config, [0, 1, 2]) for kind in (PrivilegedLQG, LQG))
+    np.testing.assert_allclose(privileged.signals.v_p, plain.signals.v_p, rtol=1e-5)
+
+
+def test_other_slots_than_the_known_ones_are_refused():
+    privileged = PrivilegedLQG().for_episodes(make_config("randomized", **PLAIN), [1, 2])
+    with pytest.raises(ValueError, match="2 pullers are known, got 3 slots"):
+        privileged.predict(next(observations()))

@@ -19,10 +19,10 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.spaces import MEASURED
 from cz_gym.support.errors import CzError, map_arrays
 from cz_gym.tools.export.controllers import make_block
-from cz_gym.tools.registry import CONTROLLERS, CRYSTAL_CONTROLLERS, TASKS, find_controller, make_controller
+from cz_gym.tools.registry import CONTROLLERS, CRYSTAL_CONTROLLERS, KNOWN, find_controller, make_controller
 from tests.observed import PLAIN, actions_of, measured
 
-ALL = [(each, task) for task in (BODY, CRYSTAL) for each in TASKS[task.name].known if not each.slow]
+ALL = [(each, task) for task in (BODY, CRYSTAL) for each in KNOWN[task.name] if not each.slow]
 SEEING = [(each, task) for each, task in ALL if not each.bound or each.observation == "measured"]
 OTHER = {"parameters": Parameters(r_0=0.1), "control_interval": 2.0}
 

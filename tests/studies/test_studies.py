@@ -1,4 +1,4 @@
-"""Studies on small runs: model cards, the frontier, the leaderboard, speed, stock learners."""
+"""Studies on small runs: model cards, the frontier, the leaderboard, speed, stock learners, robustness."""
 
 import json
 import shutil
@@ -8,13 +8,15 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import yaml
 
 from cz_gym import agents
 from cz_gym.evaluation.protocol import CASES, TRAINING_SEEDS
+from cz_gym.evaluation.rollout import rollout
 from cz_gym.tools.report.task_records import contract_hash
-from studies import cards, frontier, leaderboard, speed, stock
+from studies import cards, frontier, leaderboard, robustness, speed, stock
 
 FIGURES = {key: {"mean": 0.0, "ci95": [0.0, 0.5]} for key in (*(of.metric for of in cards.FIGURES), cards.RETURN)}
 
@@ -204,3 +206,22 @@ def test_runs_are_kept_and_the_table_has_each_seed(tmp_path, monkeypatch, capsys
     (tmp_path / "runs.csv").write_text("learner\n\nppo")
     assert stock.main([name, "--out", str(tmp_path)]) == 2
     assert "no runs of this study, or damaged" in capsys.readouterr().err
+
+
+# Robustness: the search on a grid and the altered policy
+
+
+def test_robustness_is_the_largest_change_that_a_bisection_finds():
+    assert [robustness.largest((1.0, 2.0, 3.0, 4.0), lambda x, end=end: x <= end) for end in (0.5, 1.0, 3.5, 9.0)] == [
+        None, 1.0, 3.0, 4.0,
+    ]  # fmt: skip
+
+
+def test_an_altered_policy_scales_the_pull_and_holds_its_actions_back():
+    policy, config = robustness.policy_and_config("paper-tuned", "randomized", 0.1)
+    plain, same = (rollout(each, config, [1, 2]) for each in (policy, robustness.Altered(policy)))
+    np.testing.assert_array_equal(plain.signals.v_p, same.signals.v_p)
+    late = rollout(robustness.Altered(policy, factor=2.0, late=3), config, [1, 2]).signals
+    v_0 = config.parameters.v_0
+    np.testing.assert_array_equal(late.v_p[:3], v_0)
+    np.testing.assert_allclose(late.v_p[3] - v_0, 2.0 * (plain.signals.v_p[0] - v_0), rtol=1e-5)

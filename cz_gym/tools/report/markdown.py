@@ -17,38 +17,20 @@ from cz_gym.support.units import KILO, MM, PERCENT
 from cz_gym.tools.episodes import Benchmark
 from cz_gym.tools.report.task_records import BODY_DRIVES, contract_hash, task_of
 
-from .tables import (
-    FAILURES,
-    FEWEST,
-    HEATER_STEP,
-    NOTHING,
-    PULL_STEP,
-    RMSE,
-    WHO,
-    Column,
-    Table,
-    chosen,
-    comparison,
-    crystals,
-    deciding,
-    rows,
-    too_few,
-    who,
-)
-from .tables import markdown as table
+from . import tables
 
 DIAMETER = 0.5
 """Millimetre of diameter, in millimetres of radius."""
 FIT = 0.01
 """Largest share of lost crystals of a controller that is recommended [-]."""
-VG = Column("mean_pull_within_3pct", "v/G within 3 % [% of time]", 1, PERCENT)
+VG = tables.Column("mean_pull_within_3pct", "v/G within 3 % [% of time]", 1, PERCENT)
 BESIDE = (
-    FAILURES._replace(heading="crystals lost [%]"),
-    Column("rmse_mm", "diameter RMSE [mm]", 3, DIAMETER),
-    Column("max_error_mm", "largest diameter error [mm]", 2, DIAMETER),
+    tables.FAILURES._replace(heading="crystals lost [%]"),
+    tables.Column("rmse_mm", "diameter RMSE [mm]", 3, DIAMETER),
+    tables.Column("max_error_mm", "largest diameter error [mm]", 2, DIAMETER),
     VG,
-    PULL_STEP,
-    HEATER_STEP,
+    tables.PULL_STEP,
+    tables.HEATER_STEP,
     next(column for column in BODY_DRIVES if column.metric == "time_at_limits"),
 )
 """Columns beside the scrap."""
@@ -74,20 +56,20 @@ def band(case: Case) -> str:
     return f"±{2.0 * (case.tolerance or 0.0) / MM:g} mm"
 
 
-def outcome(benchmark: Benchmark, case: Case, interval: bool = True) -> Table:
+def outcome(benchmark: Benchmark, case: Case, interval: bool = True) -> tables.Table:
     """Return heads and rows of a scenario's table for a grower, the fewest losses first; short without ``interval``."""
     head = f"scrap: diameter outside {band(case)}" if interval else f"outside {band(case)}"
-    scrap = Column(OUTSIDE, f"{head} [% of time]", 2, PERCENT)
+    scrap = tables.Column(OUTSIDE, f"{head} [% of time]", 2, PERCENT)
     columns = [each._replace(interval=interval) for each in (scrap, *BESIDE[: None if interval else SHORT])]
     ranked = sorted(benchmark.contenders, key=lambda each: _losses(benchmark, [case], each.name))
     heads = ("controller", *(column.heading for column in columns))
-    return heads, rows(benchmark.only(contenders=ranked), case, columns)
+    return heads, tables.rows(benchmark.only(contenders=ranked), case, columns)
 
 
 def _losses(benchmark: Benchmark, cases: Sequence[Case], name: str) -> tuple[float, float]:
     """Mean shares of lost crystals and of scrap of a contender over some scenarios."""
     lost, scrap = (
-        [benchmark.mean(case, name, metric) for case in cases] for metric in (FAILURES.metric, OUTSIDE)
+        [benchmark.mean(case, name, metric) for case in cases] for metric in (tables.FAILURES.metric, OUTSIDE)
     )  # fmt: skip
     return float(np.mean(lost)), float(np.mean(scrap))
 
@@ -97,10 +79,10 @@ def recommendation(benchmark: Benchmark) -> str:
 
     Bounds do not count, and a few crystals give no recommendation.
     """
-    cases = deciding(benchmark)
+    cases = tables.deciding(benchmark)
     able, number = [each for each in benchmark.contenders if not each.bound], len(benchmark.seeds(cases[0]))
-    if not able or too_few(benchmark):
-        return f"No recommendation: {crystals(number)}, and it takes a controller and at least {FEWEST}."
+    if not able or tables.too_few(benchmark):
+        return f"No recommendation: {tables.crystals(number)}, and it takes a controller and at least {tables.FEWEST}."
     best = min(able, key=lambda each: _losses(benchmark, cases, each.name))
     lost, share = _losses(benchmark, cases, best.name)
     steady = np.mean([benchmark.mean(case, best.name, VG.metric) for case in cases])
@@ -113,9 +95,9 @@ def recommendation(benchmark: Benchmark) -> str:
     place, up, down, phase, delay, _ = _margins(best, cases[0])[-1]
     loop = f" Its loop, opened at the {place}, bears {down} to {up} times its gain, {phase} degrees and {delay} s more."
     return (
-        f"{fate} of {crystals(number)} on {' and '.join(case.name for case in cases)}. The diameter is "
+        f"{fate} of {tables.crystals(number)} on {' and '.join(case.name for case in cases)}. The diameter is "
         f"outside {band(cases[0])} for {share / PERCENT:.2g} % of the time (scrap), and v/G is within 3 % for "
-        f"{steady / PERCENT:.3g} %.{loop if delay not in ('', NOTHING) else ''}"
+        f"{steady / PERCENT:.3g} %.{loop if delay not in ('', tables.NOTHING) else ''}"
     )
 
 
@@ -125,7 +107,7 @@ def warnings(benchmark: Benchmark) -> list[str]:
     for each in (each for each in benchmark.contenders if not each.bound):
         limits, steps = (
             max((benchmark.mean(case, each.name, metric), case.name) for case in benchmark.cases)
-            for metric in ("time_at_limits", HEATER_STEP.metric)
+            for metric in ("time_at_limits", tables.HEATER_STEP.metric)
         )
         if limits[0] > AT_LIMITS:
             share = f"{limits[0] / PERCENT:.0f} % of the time on {limits[1]}"
@@ -148,7 +130,7 @@ def _margins(contender: Contender, case: Case) -> list[tuple[str, ...]]:
     if not contender.learned:
         with suppress(CzError, AttributeError):  # it has no linear form, or is no feedback
             return shown(contender.make(config), config)
-    return [(NOTHING,) * len(HEADS)]
+    return [(tables.NOTHING,) * len(HEADS)]
 
 
 # The report of any benchmark, which begins with the verdict.
@@ -162,13 +144,13 @@ def summary(benchmark: Benchmark) -> str:
     heads, groups = task_of(benchmark.cases[0]).overview(benchmark)
     lines = [line for group, listed in groups.items() for line in ((f"*{group}*", *[""] * (len(heads) - 1)), *listed)]
     rests_on = "plant, random scenarios, interval, horizon, reward, metrics"
-    return f"{table(heads, lines)}\n\nContract `{contract_hash(benchmark.cases)}` ({rests_on})."
+    return f"{tables.markdown(heads, lines)}\n\nContract `{contract_hash(benchmark.cases)}` ({rests_on})."
 
 
 def brief(benchmark: Benchmark) -> str:
     """Return :func:`summary` of the random scenarios, of the controllers that a figure would show first."""
-    cases = deciding(benchmark)
-    return summary(benchmark.only(cases, chosen(benchmark, cases[0], task_of(cases[0]).quoted_rows)))
+    cases = tables.deciding(benchmark)
+    return summary(benchmark.only(cases, tables.chosen(benchmark, cases[0], task_of(cases[0]).quoted_rows)))
 
 
 def fill_in(page: str, benchmark: Benchmark) -> str:
@@ -189,7 +171,7 @@ def markdown(benchmark: Benchmark, command: str, figures: Iterable[str]) -> str:
         summary(benchmark),
         *(f"![{name.removesuffix('.png')}]({name})" for name in figures),
         "## Who took part",
-        table(WHO, who(benchmark.contenders), rule="---"),
+        tables.markdown(tables.WHO, tables.who(benchmark.contenders), rule="---"),
         *(part for case in benchmark.cases for part in _scenario(benchmark, case)),
         "## How it was made",
         f"`{command}`; versions, hashes and seeds stand in benchmark.json.",
@@ -199,34 +181,36 @@ def markdown(benchmark: Benchmark, command: str, figures: Iterable[str]) -> str:
 
 def _verdict(benchmark: Benchmark) -> list[str]:
     verdict = task_of(benchmark.cases[0]).verdict(benchmark)
-    return [verdict.sentence, *([table(verdict.heads, verdict.rows)] if verdict.rows else [])]
+    return [verdict.sentence, *([tables.markdown(verdict.heads, verdict.rows)] if verdict.rows else [])]
 
 
 def _for_a_grower(benchmark: Benchmark) -> list[str]:
     """The recommendation, what each controller gives on each scenario, and how much its loop bears."""
     parts = [recommendation(benchmark), f"# {title(benchmark.cases[0])}"]
     for case in benchmark.cases:
-        parts += [f"**{case.name}**: {case.meaning}.", table(*outcome(benchmark, case))]
+        parts += [f"**{case.name}**: {case.meaning}.", tables.markdown(*outcome(benchmark, case))]
     agents = any(each.learned for each in benchmark.contenders)
-    parts += [EXPLAINED, *warnings(benchmark), table(MARGINS, margins(benchmark)), BEARS]
+    parts += [EXPLAINED, *warnings(benchmark), tables.markdown(MARGINS, margins(benchmark)), BEARS]
     return [*parts, *(_verdict(benchmark) if agents else [])]
 
 
 def _scenario(benchmark: Benchmark, case: Case) -> list[str]:
-    meaning, task, compared = case.meaning, task_of(case), comparison(benchmark, case)
+    meaning, task, compared = case.meaning, task_of(case), tables.comparison(benchmark, case)
     pooled = [each.name for each in benchmark.contenders if len(each.training_seeds) > 1]
     return [
-        f"## {case.name} ({crystals(len(benchmark.seeds(case)))})",
+        f"## {case.name} ({tables.crystals(len(benchmark.seeds(case)))})",
         f"{meaning[0].upper()}{meaning[1:]}.",
         *(_metrics(benchmark, case, columns) for columns in task.columns),
-        *([table(*task.losses(benchmark, case))] if task.losses else []),
+        *([tables.markdown(*task.losses(benchmark, case))] if task.losses else []),
         *([_metrics(benchmark, case, compared), *filter(None, [measured_from(benchmark, case)])] if compared else []),
         *([_training_seeds(benchmark, case, pooled)] if pooled else []),
     ]
 
 
-def _metrics(benchmark: Benchmark, case: Case, columns: Sequence[Column]) -> str:
-    return table(("controller", *(column.heading for column in columns)), rows(benchmark, case, columns))
+def _metrics(benchmark: Benchmark, case: Case, columns: Sequence[tables.Column]) -> str:
+    return tables.markdown(
+        ("controller", *(column.heading for column in columns)), tables.rows(benchmark, case, columns)
+    )
 
 
 def measured_from(benchmark: Benchmark, case: Case) -> str:
@@ -236,7 +220,7 @@ def measured_from(benchmark: Benchmark, case: Case) -> str:
     names, earlier = [each.name for each in benchmark.contenders], benchmark.earlier_bound
     if met := int((earlier["scenario"] == case.name).sum()):
         fewest = min([met, *(len(benchmark.seeds(case, name)) for name in names)])
-        found = f"`{BOUND}` of an earlier run (results/bounds), on the first {crystals(fewest)}."
+        found = f"`{BOUND}` of an earlier run (results/bounds), on the first {tables.crystals(fewest)}."
         return f"Optimality gaps are measured from {found}"
     if any(benchmark.get(case, name, "cost", "gap") for name in names):
         return f"Optimality gaps are measured from `{BOUND}` on the crystals that it met."
@@ -252,7 +236,7 @@ def _training_seeds(benchmark: Benchmark, case: Case, pooled: Sequence[str]) -> 
     lines = []
     for each in (each for each in benchmark.contenders if each.name in pooled):
         seeds, (errors, failed) = each.training_seeds, (
-            benchmark.values(case, each.name, metric) for metric in (RMSE.metric, FAILURES.metric)
+            benchmark.values(case, each.name, metric) for metric in (tables.RMSE.metric, tables.FAILURES.metric)
         )  # fmt: skip
         means, lost = errors.mean(axis=1), failed.sum(axis=1)
         figures = (f"{value:.3f}" for value in (means.min(), np.median(means), means.max()))
@@ -260,13 +244,13 @@ def _training_seeds(benchmark: Benchmark, case: Case, pooled: Sequence[str]) -> 
         worst, losers = str(seeds[int(means.argmax())]), ", ".join(losses) or "none"
         lines.append((each.name, str(len(seeds)), *figures, worst, losers, str(errors.shape[1])))
     figures_of = ("best [mm]", "median [mm]", "worst [mm]")
-    return table(("agent", "training seeds", *figures_of, "worst seed", "crystals lost", "of"), lines)
+    return tables.markdown(("agent", "training seeds", *figures_of, "worst seed", "crystals lost", "of"), lines)
 
 
 def terminal(benchmark: Benchmark) -> str:
     """Return a short table a scenario, RMSE with its interval, then means, and the verdict or the recommendation."""
     task, graded = task_of(benchmark.cases[0]), benchmark.cases[0].tolerance is not None
-    verdict = task.verdict(benchmark, RMSE._replace(interval=False))
+    verdict = task.verdict(benchmark, tables.RMSE._replace(interval=False))
     parts = [_short(benchmark, case) for case in benchmark.cases]
     parts += [verdict.sentence] if verdict.rows or not graded else []
     parts += [_aligned(verdict.heads, verdict.rows)] if verdict.rows else []
@@ -278,11 +262,14 @@ def _short(benchmark: Benchmark, case: Case) -> str:
     if case.tolerance is not None:
         heads, lines = outcome(benchmark, case, interval=False)
     else:
-        full = rows(benchmark, case, columns := task_of(case).short)
-        told = [0, *(place for place in range(1, len(columns) + 1) if any(line[place] != NOTHING for line in full))]
+        full = tables.rows(benchmark, case, columns := task_of(case).short)
+        told = [
+            0,
+            *(place for place in range(1, len(columns) + 1) if any(line[place] != tables.NOTHING for line in full)),
+        ]
         names = ("controller", *(column.heading for column in columns))
         heads, *lines = (tuple(line[place] for place in told) for line in (names, *full))
-    return f"{case.name} ({crystals(len(benchmark.seeds(case)))}){grown_on}\n{_aligned(heads, lines)}"
+    return f"{case.name} ({tables.crystals(len(benchmark.seeds(case)))}){grown_on}\n{_aligned(heads, lines)}"
 
 
 def _aligned(heads: Sequence[str], lines: Iterable[tuple[str, ...]]) -> str:

@@ -358,7 +358,6 @@ class TaskRecord:
     """Type of its metrics."""
     measure: Callable[[Rollout], Any]
     """Computes the metrics of a rollout."""
-    controllers: Callable[[], tuple[Contender, ...]]
     columns: tuple[tuple[Column, ...], tuple[Column, ...]]
     """Columns of a scenario's tables: of the error, and of the drives."""
     short: tuple[Column, ...]
@@ -378,6 +377,10 @@ class TaskRecord:
     graded: bool = True
     """Whether a report for a puller states scrap, outside a tolerance of the diameter."""
 
+    def controllers(self) -> tuple[Contender, ...]:
+        """Return its named controllers, in the order of tables."""
+        return registry.KNOWN[self.environment]
+
 
 TASKS = {
     each.environment: each
@@ -388,7 +391,6 @@ TASKS = {
             CASES,
             Metrics,
             metrics,
-            lambda: registry.TASKS["Cz-v0"].known,
             (BODY_ERROR, BODY_DRIVES),
             BODY_SHORT,
             body_introduction,
@@ -402,7 +404,6 @@ TASKS = {
             CRYSTAL_CASES,
             CrystalMetrics,
             crystal_metrics,
-            lambda: registry.TASKS["CzCrystal-v0"].known,
             (CRYSTAL_ERROR, CRYSTAL_DRIVES),
             CRYSTAL_SHORT,
             crystal_introduction,
