@@ -172,6 +172,6 @@ def _priced(pid: FilteredPID, config: Config, plant: _Plant) -> Any:
 
 
 def _stable(pid: FilteredPID, config: Config) -> bool:
-    """Whether the loop of the code that runs is stable on Models I and II, without latency."""
+    """True if the loop of the code that runs is stable on Models I and II, without latency."""
     controller, dt = linear_form(pid).controller, config.control_interval
     return all(close(controller, make_puller(config.parameters, lam), dt).stable for lam in (1.0, 0.0))

@@ -47,7 +47,7 @@ class Fault(NamedTuple):
     off: float = 0.0
     """Error of the nominal values, in multiples of OFF."""
     still: bool = False
-    """Whether the drives stand still during :data:`STILL`."""
+    """True if the drives stand still during :data:`STILL`."""
 
 
 UNEVEN = tuple(np.random.default_rng(0).integers(1, 5, 997) / 2.0)
@@ -109,7 +109,7 @@ class Row(NamedTuple):
     """Radius error from half an hour on, of the crystals that were not lost [mm]."""
     lost: int
     helpless: int
-    """How many of them were lost while the drives stood still."""
+    """Number of them that were lost while the drives stood still."""
     alarms: Alarm
 
 

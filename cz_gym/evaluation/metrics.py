@@ -110,7 +110,7 @@ def radius_error(run: Rollout, offset: Floats | float = 0.0) -> Floats:
 
 
 def _lost(run: Rollout) -> npt.NDArray[np.bool_]:
-    """Whether a crystal is lost, from its failing step on, shape (steps, episodes)."""
+    """True from the failing step of a lost crystal on, shape (steps, episodes)."""
     lost: npt.NDArray[np.bool_] = run.failed & (np.arange(len(run.alive))[:, None] >= run.alive.sum(axis=0) - 1)
     return lost
 
@@ -127,7 +127,7 @@ def _rms(values: Floats, where: npt.NDArray[np.bool_] | bool = True) -> Floats:
 
 
 def _at_limits(run: Rollout) -> npt.NDArray[np.bool_]:
-    """Whether a drive is at a limit; those of a mixture are the widest of its scenarios'.
+    """True where a drive is at a limit; limits of a mixture are the widest of its scenarios'.
 
     The heater's rate is that over the shortest time in which it can make two steps of its resolution.
     """

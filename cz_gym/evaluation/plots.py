@@ -92,7 +92,7 @@ class _Panel(NamedTuple):
     label: str
     value: Callable[[Logged], Floats]
     noisy: bool = False
-    """Whether to draw single steps pale, with their running mean on top."""
+    """True to draw single steps pale, with their running mean on top."""
 
 
 _PANELS = (

@@ -51,19 +51,19 @@ class Contender:
     meaning: str
     """Description in one line, for tables."""
     default: bool = True
-    """Whether a benchmark that names no controllers runs it."""
+    """True if a benchmark that names no controllers runs it."""
     privileged: bool = False
-    """Whether it knows the puller, the state or the future, which no controller can; that makes it a bound."""
+    """True if it knows the puller, the state or the future, which no controller can; that makes it a bound."""
     slow: bool = False
-    """Whether it meets only the first few episodes, which are cached, and runs only when slow ones are asked for."""
+    """True if it meets only the first few episodes, which are cached, and runs only when slow ones are asked for."""
     on_puller: bool = False
-    """Whether a benchmark on a puller of the user's own that names no controllers runs it."""
+    """True if a benchmark on a puller of the user's own that names no controllers runs it."""
     quoted: bool = False
-    """Whether it stands in short tables and small figures, and beside a controller of the user's own."""
+    """True if it stands in short tables and small figures, and beside a controller of the user's own."""
     action: str = "direct"
     """Mode of its actions (:func:`cz_gym.spaces.drives_of`)."""
     own: bool = False
-    """Whether it comes from the user's own file: figures show it first."""
+    """True if it comes from the user's own file: figures show it first."""
     training_seeds: tuple[int, ...] = ()
     """Training seeds of an agent, empty for a controller."""
     trained: tuple[Any, ...] = ()
@@ -145,7 +145,7 @@ class Case:
     model: str | None = None
     """ "I" or "II", or None for the scenario's own draw."""
     default: bool = True
-    """Whether a benchmark that names no scenarios runs it."""
+    """True if a benchmark that names no scenarios runs it."""
     interval: float | None = None
     """Time between actions [s]; None: the puller's."""
     meniscus: MeniscusModel = HURLE
@@ -158,7 +158,7 @@ class Case:
     first_seed: int = TEST_SEEDS.start
     """Seed of its first crystal."""
     process: Process = BODY
-    """What is simulated."""
+    """Process that is simulated."""
     stage: Any = None
     """Part of the crystal that is grown, where the process has stages."""
     most: int = len(TEST_SEEDS)

@@ -32,9 +32,9 @@ class Rollout:
     reward: Floats
     """Reward, 0 after the end, shape (steps, episodes)."""
     alive: npt.NDArray[np.bool_]
-    """Whether the step was taken: true up to and including the last one, shape (steps, episodes)."""
+    """True up to and including the last step, shape (steps, episodes)."""
     failed: npt.NDArray[np.bool_]
-    """Whether the episode ended in a failure, shape (episodes,)."""
+    """True of an episode that ended in a failure, shape (episodes,)."""
     start: Any
     """Signals at t = 0, each of shape (1, episodes)."""
     seconds_in_policy: float

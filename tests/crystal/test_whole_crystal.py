@@ -170,6 +170,7 @@ def odd(**changes):
     ("settings", "said"),
     [
         (odd(v_crown=3e-5), "at a length of .* mm the melt would have to be colder"),
+        (odd(M_0=62.333), "the charge of 62.333 kg is used up"),  # 62.329 kg of crystal, 0.009 kg of meniscus
         (odd(M_0=50.0), "at a length of .* mm the charge of 50 kg is used up: the crystal weighs 62.3 kg"),
         (odd(crown_length=0.02, body_length=0.5), "mm the meniscus is out of its range"),
         (odd(body_length=0.0), "a tail needs a body: body_length_mm = 0 must be at least twice crown_length_mm = 90"),
@@ -269,6 +270,19 @@ def test_every_scenario_grows_some_minutes_from_each_stage(name):
         np.testing.assert_allclose(seen.L, info["L"], atol=1e-6)
         np.testing.assert_allclose(seen.v_p, info["v_p"] - info["v_p_ref"], atol=1e-11)
     assert (np.abs(info["r_c"] - info["r_ref"]) < 3 * MM).all()
+
+
+def test_previews_are_what_is_told_at_that_length_later():
+    """Where nothing but the recipe's own error moves it."""
+    env = CzCrystalEnv(scenario="only-recipe", stage=0.02, control_interval=20.0, **PLAIN)
+    rows = [env.reset(seed=0)[0], *(env.step(np.zeros(2, np.float32))[0] for _ in range(150))]
+    seen = decode(np.array(rows), *env.config.ranges, env.config.process)
+    for signal, apart in (("r_ref", 0.02 * MM), ("T_1_ref", 0.02)):
+        for name, by in (("5mm", 5.0 * MM), ("25mm", 25.0 * MM)):
+            reached = seen.L + by < seen.L[-1]
+            later = np.interp(seen.L[reached] + by, seen.L, getattr(seen, signal))
+            assert reached.sum() > 5
+            np.testing.assert_allclose(getattr(seen, f"{signal}_{name}")[reached], later, atol=apart)
 
 
 def test_the_recipes_error_runs_with_length():

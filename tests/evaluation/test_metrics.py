@@ -14,6 +14,7 @@ from cz_gym.config import make_config
 from cz_gym.crystal import recipe
 from cz_gym.crystal.process import CRYSTAL, nominal_recipe
 from cz_gym.crystal.recipe import FAILURE_MODES, relative_margin
+from cz_gym.episodes.scenario import Actuators, Scenario
 from cz_gym.evaluation.metrics import Metrics, crystal_metrics, metrics
 from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.evaluation.rollout import Rollout, rollout
@@ -115,6 +116,10 @@ def test_time_at_the_limits_counts_steps_in_which_a_drive_is_at_its_range_or_sle
     assert of(made_up(20, scenario="puller", v_p=V + np.cumsum(steps))).time_at_limits == pytest.approx(3 / 20)
     move = np.where(np.arange(20) < 10, 0.0, drives.heater_step)  # slower than its slew rate
     assert of(made_up(20, scenario="puller", Q_H=Q + move)).time_at_limits == 0.0
+    # A heater whose slew is two of its steps in one interval: one such move is at the limit, whatever came before.
+    coarse = Scenario("coarse", actuators=Actuators(heater_step=100.0, heater_slew=200.0 / DT))
+    once = Q + 200.0 * (np.arange(20) >= 10)
+    assert of(made_up(20, scenario=coarse, Q_H=once)).time_at_limits == pytest.approx(1 / 20)
     far = Q + np.linspace(0.0, config.heater_range, 200)
     assert of(made_up(200, scenario="puller", Q_H=far)).time_at_limits == pytest.approx(1 / 200)
 

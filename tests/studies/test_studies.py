@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from cz_gym import agents
+from cz_gym.evaluation import protocol
 from cz_gym.evaluation.protocol import CASES, TRAINING_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.tools.report.task_records import contract_hash
@@ -95,7 +96,7 @@ MEAN = {"mean": 0.0125, "ci95": None}
 @pytest.fixture
 def submissions(tmp_path, monkeypatch):
     """A folder with one submission, the shipped PPO under another name, with a claim that is too good."""
-    monkeypatch.setattr(leaderboard, "CASES", CASES[:1])
+    monkeypatch.setattr(protocol, "CASES", CASES[:1])
     monkeypatch.setattr(leaderboard, "CONTROLLERS", leaderboard.CONTROLLERS[:2])
     folder = tmp_path / "submissions" / "mine"
     folder.mkdir(parents=True)

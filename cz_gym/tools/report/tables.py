@@ -29,7 +29,7 @@ class Column(NamedTuple):
     """Unit of the column, in units of the metric."""
     kind: str = "mean"
     interval: bool = True
-    """Whether the intervals are shown."""
+    """True if the intervals are shown."""
 
     def text(self, estimate: Estimate | None) -> str:
         """Return the mean in the column's unit, with its interval if it has one that is shown."""

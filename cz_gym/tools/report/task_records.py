@@ -367,15 +367,15 @@ class TaskRecord:
     verdict: Callable[..., Verdict]
     panels: tuple[Panel, ...]
     losses: Callable[[Benchmark, Case], Table] | None = None
-    """How crystals were lost, if there are several ways and parts."""
+    """Table of the ways in which crystals were lost, if there are several."""
     by_length: bool = False
-    """Whether pictures show signals against the crystal's length, not against time."""
+    """True if pictures show signals against the crystal's length, not against time."""
     quoted_rows: int = 8
     """Largest number of controllers in the table that pages quote."""
     has_bound: bool = True
-    """Whether gaps may be measured from the bound of an earlier run."""
+    """True if gaps may be measured from the bound of an earlier run."""
     graded: bool = True
-    """Whether a report for a puller states scrap, outside a tolerance of the diameter."""
+    """True if a report for a puller states scrap, outside a tolerance of the diameter."""
 
     def controllers(self) -> tuple[Contender, ...]:
         """Return its named controllers, in the order of tables."""
