@@ -17,11 +17,13 @@ from torch import nn
 from cz_gym.body.signals import Cost, cost_terms, saturated
 from cz_gym.config import Config
 from cz_gym.crystal.process import ENVIRONMENTS
-from cz_gym.engine.tangents import DifferentiableBatch, smooth
+from cz_gym.engine.tangents import DifferentiableBatch, Step, smooth
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.process import Process
 from cz_gym.spaces import drives_of
 from cz_gym.support.errors import CzError
+
+from .window import Window
 
 
 def advance(state: torch.Tensor, action: torch.Tensor, batch: DifferentiableBatch) -> Any:
@@ -88,8 +90,6 @@ TIMES = tuple(float(time) for time in np.geomspace(3.0, 3600.0, 8))
 """Time constants of the leaky means [s]."""
 GAINS = (0.2, 0.08)
 """Actions for a network output of one: pull speed and heater [-]."""
-FEATURE_LIMIT = 30.0
-"""Standardised features are clipped to +- this [-]."""
 STD_RANGE = 1e-4, 10.0
 """Range that a feature's standard deviation is clipped to before it divides [-]."""
 STATISTICS_RATE = 0.1
@@ -104,6 +104,8 @@ class RecurrentPolicy(BasePolicy):
     time between actions [s], ``environment`` the name of the one that it acts in.
     """
 
+    feature_limit: ClassVar[float] = 30.0
+    """Standardised features are clipped to +- this [-]."""
     keep: torch.Tensor
     gain: torch.Tensor
     differences: torch.Tensor
@@ -134,6 +136,11 @@ class RecurrentPolicy(BasePolicy):
             nn.init.zeros_(parameter)
         self.optimizer = torch.optim.Adam(self.parameters(), lr=lr_schedule(1.0), betas=betas)
 
+    @property
+    def usable_std(self) -> torch.Tensor:
+        """Standard deviation that features are divided by, shape (features,)."""
+        return self.std.clamp(*STD_RANGE)
+
     def initial_memory(self, n: int) -> torch.Tensor:
         """Memory of n crystals that begin, shape (n, means + units)."""
         return torch.zeros(n, self.means + self.gru.hidden_size)
@@ -146,7 +153,8 @@ class RecurrentPolicy(BasePolicy):
     def forward(self, measured: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the action, shape (n, 2), unclipped, and the memory after a reading, shape (n, channels)."""
         features, means = self.update_means(measured, memory)
-        x = torch.clamp((features - self.mean) / self.std.clamp(*STD_RANGE), -FEATURE_LIMIT, FEATURE_LIMIT)
+        limit = self.feature_limit
+        x = torch.clamp((features - self.mean) / self.usable_std, -limit, limit)
         h = self.gru(x, memory[:, self.means :])
         y = torch.cat([x, h], dim=1)
         action = (self.linear(y) + self.output(torch.tanh(self.layer(y)))) * self.gains
@@ -211,10 +219,10 @@ def leaky_means(interval: float, process: Process) -> tuple[npt.NDArray[Any], np
 
 # Analytic policy gradients (APG) with the interface of stable-baselines3's algorithms.
 #
-# The plant's step is differentiated exactly (:func:`advance`), so that torch's autograd gives the gradient
-# of the cost by the policy's weights: back-propagation through time over windows of an episode, in place of a gradient
-# that is estimated from rewards. The method knows the plant's equations while it trains; the policy reads sensors
-# alone.
+# The plant's step is differentiated exactly, so that the gradient of the cost by the policy's weights is
+# back-propagation through time over windows of an episode (:class:`cz_gym.agents.window.Window`; :func:`advance` gives
+# the same to torch's autograd), in place of a gradient that is estimated from rewards. The method knows the plant's
+# equations while it trains; the policy reads sensors alone.
 
 WARM_UP = 0.05
 """Share of the training during which the features' statistics are updated."""
@@ -290,6 +298,7 @@ class APG(BaseAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         crystals = _Crystals(self._config(), self.n_envs, self.window, [self.seed or 0, self.num_timesteps])
+        window = Window(self.policy, StepCost(self._config()), crystals.batch, self.window)
         memory = self.policy.initial_memory(self.n_envs)
         watch.on_training_start(locals(), globals())
         going, updates = True, 0
@@ -297,13 +306,14 @@ class APG(BaseAlgorithm):
             self._update_current_progress_remaining(self.num_timesteps, total_timesteps)
             self._update_learning_rate(self.policy.optimizer)
             watch.on_rollout_start()
-            loss, memory, going = self._window(crystals, memory, watch)
+            going = self._grow(crystals, memory, window, watch)
             watch.on_rollout_end()
-            self._descend(loss)
+            cost, memory = window.backward(), window.memory
+            self._descend()
             lost, over = crystals.replace_finished()
             memory[over] = 0.0
             updates += 1
-            self.logger.record("train/cost", loss.item())
+            self.logger.record("train/cost", cost)
             self.logger.record_mean("rollout/lost", lost)
             if updates % log_interval == 0:
                 self.logger.dump(self.num_timesteps)
@@ -311,35 +321,24 @@ class APG(BaseAlgorithm):
         watch.on_training_end()
         return self
 
-    def _window(
-        self, crystals: "_Crystals", memory: torch.Tensor, watch: BaseCallback
-    ) -> tuple[torch.Tensor, torch.Tensor, bool]:
-        """Drive every crystal through a window: its mean cost, differentiable, the memory, and whether to go on."""
-        policy, going = self.policy, True
+    def _grow(self, crystals: "_Crystals", memory: torch.Tensor, window: Window, watch: BaseCallback) -> bool:
+        """Drive every crystal through a window: whether to go on."""
+        policy, going, seen = self.policy, True, []
         warm = self._current_progress_remaining > 1.0 - WARM_UP
-        policy.set_training_mode(True)
-        cost_of = StepCost(self._config())
-        state, measured = crystals.state, crystals.measured
-        costs, seen = [], []
+        window.begin(torch.from_numpy(crystals.state), memory)
         for _ in range(self.window):
+            action = window.act(torch.from_numpy(crystals.measured))
             if warm:
-                with torch.no_grad():
-                    seen.append(policy.update_means(measured, memory)[0])
-            action, memory = policy(measured, memory)
-            before = state
-            state, measured, grows, target = advance(before, action, crystals.batch)
-            costs.append(cost_of(before, action, state, grows, target))
+                seen.append(window.features)
+            window.record(crystals.step(action.numpy()))
             self.num_timesteps += self.n_envs
             going = watch.on_step() and going
-        crystals.state, crystals.measured = state.detach(), measured.detach()
         if warm:
             policy.observe_statistics(torch.cat(seen))
-        return torch.stack(costs).mean(), memory.detach(), going
+        return going
 
-    def _descend(self, loss: torch.Tensor) -> None:
+    def _descend(self) -> None:
         """Take a step along the gradient, unless it is not finite."""
-        self.policy.optimizer.zero_grad()
-        torch.autograd.backward(loss)
         norms = self.norms[self.norms > 0.0].numpy()
         limit = CLIP_AT * float(np.median(norms)) if norms.size else math.inf
         norm = float(torch.nn.utils.clip_grad_norm_(self.policy.parameters(), limit))
@@ -371,7 +370,13 @@ class _Crystals:
 
     def _draw(self, slots: list[int]) -> None:
         seeds = self._random.integers(len(TRAINING_SEEDS), size=len(slots)).tolist()
-        self.state, self.measured = map(torch.from_numpy, self.batch.reset(seeds, slots))
+        self.state, self.measured = self.batch.reset(seeds, slots)
+
+    def step(self, action: npt.NDArray[np.float32]) -> Step:
+        """Hold actions, shape (n, 2), for one control interval."""
+        step = self.batch.step(action)
+        self.state, self.measured = step.state, step.measured
+        return step
 
     def replace_finished(self) -> tuple[int, list[int]]:
         """Draw new crystals for those that were lost or have grown to their end: how many were lost, and all slots."""

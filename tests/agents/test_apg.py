@@ -6,10 +6,12 @@ import torch
 from stable_baselines3.common.env_util import make_vec_env as scalar_environments
 
 from cz_gym.agents.apg import APG, StepCost, advance
+from cz_gym.agents.window import Window
 from cz_gym.body.signals import SCALES, WEIGHTS, saturated
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.engine.tangents import STATES, DifferentiableBatch
+from cz_gym.evaluation.protocol import scenarios
 from cz_gym.sb3 import make_vec_env
 from cz_gym.support.errors import CzError
 
@@ -73,6 +75,30 @@ def test_the_gradient_is_that_of_differences(scenario, apart, config):
                 parameter += share * direction
             costs.append(float(driven(policy, batch, 40)))
     assert along == pytest.approx((costs[0] - costs[1]) / 4e-3, rel=apart)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "config"), [("all", CONFIG), ("puller", CONFIG), ("sensor-fault", CRYSTALS), ("randomized", CRYSTALS)]
+)
+def test_the_written_out_gradient_is_autograd_s(scenario, config):
+    """Of every weight, through lost crystals, clipped features and held readings too."""
+    policy, scene = some_policy(config.process.name), scenarios(scenario)
+    policy.std[:3] = 1e-3
+    with torch.no_grad():
+        policy.linear.weight *= 4.0
+    cost = driven(policy, DifferentiableBatch(config.with_scenario(scene), 12), 60)
+    cost.backward()
+    wanted = {name: parameter.grad.clone() for name, parameter in policy.named_parameters()}
+    batch = DifferentiableBatch(config.with_scenario(scene), 12)
+    window, (state, measured) = Window(policy, StepCost(batch.config), batch, 60), batch.reset(range(12))
+    window.begin(torch.from_numpy(state), policy.initial_memory(12))
+    for _ in range(60):
+        step = batch.step(window.act(torch.from_numpy(measured)).numpy())
+        measured = step.measured
+        window.record(step)
+    assert window.backward() == pytest.approx(cost.item(), rel=1e-6)
+    for name, parameter in policy.named_parameters():
+        assert float((parameter.grad - wanted[name]).norm()) < 1e-4 * float(wanted[name].norm()), name
 
 
 def stepped(scenario, action, actions):
