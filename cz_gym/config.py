@@ -254,7 +254,7 @@ def _computed(process: Process, meniscus: MeniscusModel, parameters: Parameters)
         for lam in (0.0, 0.4, 1.0):
             p = process.derive(parameters, Factors(lam=lam), meniscus)
             numbers += [*p, process.hidden_load(3.0, p)]
-            for x, u, d in process.points(p):
+            for x, u, d in process.check_points(p):
                 numbers += [*process.rates(x, u, d, p, meniscus), *process.perfect_readings(x, p, meniscus)]
     return tuple(numbers)
 

@@ -213,8 +213,8 @@ class Process(NamedTuple):
     """``cost_slopes(cost_inputs, weights)``: the derivative of each term by its own number."""
     reward: Function
     """``reward(cost, grows)``: the reward of a step [-], whose cost is ``Cost``; false if the crystal is lost in it."""
-    points: Function
-    """``points(p)``: a list of (x, u, d) in reach of a crystal. What the plant computes there is hashed
+    check_points: Function
+    """``check_points(p)``: a list of (x, u, d) in reach of a crystal. What the plant computes there is hashed
     (:attr:`cz_gym.config.Config.plant_hash`)."""
     weights: Any
     """The usual weights of the cost's terms, a named tuple of numbers."""

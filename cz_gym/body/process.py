@@ -128,7 +128,7 @@ def cost_inputs(x: Any, u: Any, before: Any, memory: Any, slot: Any, t: Any) -> 
     return signals.Cost(error, memory.v_p_mean / p.v_0 - 1.0, u.v_p - before.v_p, u.Q_H - before.Q_H)
 
 
-def points(p: Puller) -> list[tuple[State, Inputs, Disturbance]]:
+def check_points(p: Puller) -> list[tuple[State, Inputs, Disturbance]]:
     """Three crystals off their operating point, with drives and disturbances off nominal."""
     sides = ((1.02, 0.9, 4.0, 0.3), (0.97, 1.1, -3.0, -0.5), (1.0, 1.3, 9.0, 1.1))
     return [
@@ -169,7 +169,7 @@ BODY = Process(
     cost_terms=signals.cost_terms,
     cost_slopes=signals.cost_slopes,
     reward=signals.reward,
-    points=points,
+    check_points=check_points,
     weights=signals.WEIGHTS,
     StepMemory=StepMemory,
     update_memory=update_memory,

@@ -163,7 +163,7 @@ def cost_inputs(x: Any, u: Any, before: Any, memory: Any, slot: Any, t: Any) -> 
     return Cost(error, memory.v_p_mean / p.v_0, u.v_p - before.v_p, u.Q_H - before.Q_H)
 
 
-def points(p: Any) -> list[tuple[CrystalState, Inputs, Disturbance]]:
+def check_points(p: Any) -> list[tuple[CrystalState, Inputs, Disturbance]]:
     """Crystals off the body's operating point, at four lengths, with drives and disturbances off nominal."""
     sides = ((0.15, 0.8, 0.0, 9.0), (0.7, 0.4, 0.2, 4.0), (1.02, 0.9, 0.5, -3.0), (0.5, 1.2, 0.9, 6.0))
     return [
@@ -199,7 +199,7 @@ CRYSTAL = BODY._replace(
     logged=signals.logged,
     brief_info=signals.brief_info,
     cost_inputs=cost_inputs,
-    points=points,
+    check_points=check_points,
     StepMemory=StepMemory,
     update_memory=update_memory,
     draw_sensor_noise=draw_load_cell_noise,

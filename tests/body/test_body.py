@@ -10,12 +10,11 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv, Parameters, State, make_puller
-from cz_gym.body.process import linearise, radius_model
+from cz_gym.body.process import radius_model
 from cz_gym.body.signals import PULL_TOLERANCE, Cost, Weights, coefficients, cost_slopes, cost_terms, reward
 from cz_gym.config import make_config
 from cz_gym.engine.tangents import DifferentiableBatch
 from cz_gym.episodes.scenario import Actuators
-from cz_gym.jit import kernel
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.plant import (
     NO_DISTURBANCE,
@@ -115,52 +114,6 @@ def test_an_hour_with_a_heater_one_kelvin_too_hot_thins_the_crystal_by_nine_mill
     assert x.r_c - p.r_0 == pytest.approx(-9.4e-3, abs=0.1e-3)
 
 
-def test_compiled_equations_equal_the_plain_ones(states, rng):
-    @kernel
-    def loop(rows, u, d, p, out):
-        for i in range(len(rows)):
-            x = State(rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4])
-            load = Disturbance(d[i, 0], d[i, 1], d[i, 2])
-            inputs = Inputs(u[i, 0], u[i, 1])
-            rate = rates(x, inputs, load, p, hurle_slope)
-            new = rk4(x, inputs, load, p, 5.0, hurle_slope)
-            grown = growth(x, load, p, hurle_slope)
-            for j in range(5):
-                out[i, j] = rate[j]
-                out[i, 5 + j] = new[j]
-            out[i, 10] = grown.v_g
-            out[i, 11] = hidden_load(d[i, 1] * 20.0, p)
-
-    p = make_puller(lam=0.4)
-    u, d = drawn_inputs(rng, p, 200)
-    out = np.zeros((200, 12))
-    loop(np.array(states).T, np.array(u).T, np.array(d).T, p, out)
-    plain = [
-        *rates(states, u, d, p, hurle_slope),
-        *rk4(states, u, d, p, 5.0, hurle_slope),
-        growth(states, d, p, hurle_slope).v_g,
-        hidden_load(d.dT_i * 20.0, p),
-    ]
-    scale = np.abs(out).max(axis=0)
-    np.testing.assert_allclose(out / scale, np.array(plain).T / scale, rtol=1e-12, atol=1e-13)
-
-
-def test_runge_kutta_is_of_fourth_order():
-    p = make_puller(lam=0.7)
-    x = np.array([p.r_0, 0.8 * p.h_0, p.T_1_0 + 5, p.T_2_0, p.T_b_0 + 2])
-    u, d = Inputs(1.2 * p.v_0, p.Q_H_0 + 8000.0), Disturbance(500.0, 0.3, 0.95)
-    exact = integrated(x, Truth(*u, *d), p, 240.0).y[:, -1]
-    steps = np.array([10.0, 15.0, 20.0, 30.0, 40.0])
-    errors = []
-    for dt in steps:
-        new = State(*x)
-        for _ in range(round(240.0 / dt)):
-            new = rk4(new, u, d, p, dt, hurle_slope)
-        errors.append(np.abs((np.array(new) - exact) / exact)[:2].max())
-    order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
-    assert order == pytest.approx(4.0, abs=0.15)
-
-
 @pytest.mark.parametrize(("interval", "scenario"), [(5.0, "randomized"), (2.0, MELTING), (10.0, "hard")])
 def test_an_hour_of_driven_motion_agrees_with_scipy(interval, scenario):
     env = CzEnv(scenario, control_interval=interval, horizon=HOUR, info="all")
@@ -211,24 +164,6 @@ def test_published_transfer_functions(lam, second_pole):
     assert model.lead == pytest.approx(-46.0050, rel=5e-4)
     assert model.constant == pytest.approx(1.0041, abs=5e-4)
     assert model.zero == pytest.approx(0.0218, abs=5e-5)
-
-
-def test_complex_step_against_finite_differences():
-    p = make_puller(lam=0.4)
-    x = State(p.r_0 + 1.0 * MM, p.h_0 - 0.5 * MM, p.T_1_0 + 3.0, p.T_2_0 - 2.0, p.T_b_0 + 1.0)
-    u = Inputs(0.9 * p.v_0, p.Q_H_0 + 500.0)
-    model = linearise(p, x=x, u=u, d=NO_DISTURBANCE._replace(Q_d=300.0, dT_i=0.5))
-    point = np.array([*x, *u, 300.0, 0.5])
-    for j in range(len(point)):
-        step = 1e-5 * abs(point[j])
-        sides = []
-        for sign in (1.0, -1.0):
-            at = point.copy()
-            at[j] += sign * step
-            d = NO_DISTURBANCE._replace(Q_d=at[7], dT_i=at[8])
-            sides.append(np.array(rates(State(*at[:5]), Inputs(*at[5:7]), d, p, hurle_slope)))
-        column = (sides[0] - sides[1]) / (2.0 * step)
-        np.testing.assert_allclose(np.hstack([model.A, model.B])[:, j], column, rtol=2e-6, atol=1e-12)
 
 
 P, V_0 = make_puller(), 1.2e-3 / 60

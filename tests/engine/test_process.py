@@ -143,7 +143,7 @@ TANK = Process(
     true_state=jittable(lambda slot, seen, t: Truth(slot.x.h - slot.puller.h_0, slot.x.T - slot.puller.T_0)),
     logged=logged, brief_info=jittable(lambda slot, seen: BriefInfo(slot.x.h, slot.puller.h_0 + seen.h_ref)),
     cost_terms=cost_terms, cost_slopes=cost_slopes, reward=reward, StepMemory=StepMemory,
-    points=lambda p: [(Level(0.9 * p.h_0, p.T_0 + 5.0), Inputs(p.v_0, 100.0), Load(3.0))],
+    check_points=lambda p: [(Level(0.9 * p.h_0, p.T_0 + 5.0), Inputs(p.v_0, 100.0), Load(3.0))],
     update_memory=jittable(lambda memory, u, about, dt: StepMemory(memory.fed + u.v_p * dt)),
     weights=WEIGHTS, table=(3, 2),
 )  # fmt: skip

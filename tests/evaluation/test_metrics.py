@@ -170,8 +170,7 @@ def test_metrics_of_a_batch_are_those_of_its_episodes():
 LIMIT = 8 * MM
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("stage", ["crown", "tail", "whole"])
+@pytest.mark.parametrize("stage", ["crown", "tail", pytest.param("whole", marks=pytest.mark.slow)])
 def test_energy_and_time_are_those_of_the_recipe(stage):
     """In open loop without disturbances: the power's integral over the time of the recipe, by the mass grown."""
     config = make_config("nominal", observation="measured", action="direct", process=CRYSTAL, stage=stage)
