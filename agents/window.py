@@ -64,7 +64,8 @@ class Window:
         torch.lerp(candidate, h, gates[units : 2 * units], out=after)
         tanh = torch.mm(policy.layer.weight, y, out=self.tanh[k]).add_(policy.layer.bias[:, None]).tanh_()
         action = torch.mm(policy.linear.weight, y, out=self.action[k]).add_(policy.linear.bias[:, None])
-        return action.addmm_(policy.output.weight, tanh).mul_(self.gains).T
+        moves: Tensor = action.addmm_(policy.output.weight, tanh).mul_(self.gains).T
+        return moves
 
     def record(self, step: Step) -> None:
         """Keep a step of the plant that followed the last action."""
@@ -79,7 +80,7 @@ class Window:
     @property
     def features(self) -> Tensor:
         """Features of the present step, shape (n, features), as they are before they are standardised."""
-        return self.shown.T @ self.policy.differences
+        return torch.mm(self.shown.T, self.policy.differences)
 
     @property
     def memory(self) -> Tensor:
@@ -95,7 +96,7 @@ class Window:
         by_before, by_action, by_after, by_target = torch.autograd.grad(loss, leaves)
         with torch.no_grad():
             self._back(by_before, by_action.float().transpose(1, 2).contiguous(), by_after, by_target)
-        return loss.item()
+        return float(loss.detach())
 
     def _back(self, by_before: Tensor, by_action: Tensor, by_after: Tensor, by_target: Tensor) -> None:
         """Take the derivatives of the cost by each step's own numbers back to the weights."""
