@@ -10,8 +10,8 @@ import sys
 import timeit
 from collections.abc import Callable, Mapping
 from functools import partial
+from importlib import import_module
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -71,9 +71,8 @@ def cases(slots: int = SLOTS, sb3_slots: int = SB3_SLOTS) -> dict[str, Callable[
             rows[f"{name}, {n} thread{'s' * (n > 1)}"] = partial(make, slots, n)
     rows["step without derivatives"] = partial(differentiable, False)
     rows["step with derivatives"] = partial(differentiable, True)
-    rows["SB3 adapter over the batch"] = lambda: resolve_name("cz_gym.sb3:make_vec_env")(sb3_slots)
-    ours, dummy = partial(gym.make, "cz_gym:Cz-v0"), "stable_baselines3.common.vec_env:DummyVecEnv"
-    rows["SB3 DummyVecEnv"] = lambda: resolve_name(dummy)([ours] * sb3_slots)
+    rows["SB3 adapter over the batch"] = partial(for_sb3, sb3_slots)
+    rows["SB3 DummyVecEnv"] = partial(for_sb3, sb3_slots, dummy=True)
     rows["Cz-v0 scalar, camera"] = partial(CzEnv, "nominal", observation="camera")
     return rows
 
@@ -142,9 +141,19 @@ def differentiable(derivatives: bool) -> Stepper:
     return repeated(inner, Stepper(256, step, batch.close))
 
 
+def for_sb3(num_envs: int, dummy: bool = False) -> Any:
+    """Make the adapter for stable-baselines3 over the native batch, or its own vector of scalar environments."""
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    from cz_gym.sb3 import make_vec_env
+
+    return DummyVecEnv([partial(gym.make, "cz_gym:Cz-v0")] * num_envs) if dummy else make_vec_env(num_envs)
+
+
 def envpool(num_envs: int, threads: int) -> Stepper:
     """Make a batch of pendulums in EnvPool, whose steps are C++."""
-    env = resolve_name("envpool:make")("Pendulum-v1", env_type="gymnasium", num_envs=num_envs, num_threads=threads)
+    make = import_module("envpool").make  # it has no wheel for every system, and no types
+    env = make("Pendulum-v1", env_type="gymnasium", num_envs=num_envs, num_threads=threads)
     env.reset()
     return batched(env, num_envs)
 

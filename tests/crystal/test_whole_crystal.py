@@ -323,17 +323,6 @@ def test_how_a_crystal_is_lost(moved, by):
     assert gained < -900.0
 
 
-def test_a_crown_freezes_when_the_pull_stops():
-    env = CzCrystalEnv(scenario="nominal", stage=0.05, **PLAIN)
-    env.reset(seed=0)
-    over = False
-    while not over:
-        *_, over, _, info = env.step(np.array([-1.0, 0.0], np.float32))
-    assert info["succeeded"] == 0.0
-    assert info["h_c"] < 1.0 * MM
-    assert env._slots["k"][0] < 100
-
-
 def test_weight_and_lean_info():
     env = gym.make("CzCrystal-v0", scenario="nominal", observation="measured", action="direct").unwrapped
     env.reset(seed=0)

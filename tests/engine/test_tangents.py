@@ -22,22 +22,9 @@ from cz_gym.spaces import ACTIONS, MEASURED
 from tests.observed import PLAIN
 
 STEPS = {
-    "r_c": 1e-7,
-    "h_c": 1e-7,
-    "T_1": 1.0,
-    "T_2": 1.0,
-    "T_b": 1e-2,
-    "v_p": 1e-9,
-    "v_p_mean": 1e-7,
-    "Q_H": 100.0,
-    "a": 1e-3,
-    "L": 1e-6,
-    "A_s": 1e-5,
-    "M_s": 1e-2,
-    "N": 1e-4,
-    "v_p_nominal": 1e-9,
-    "Q_H_nominal": 100.0,
-}
+    "r_c": 1e-7, "h_c": 1e-7, "T_1": 1.0, "T_2": 1.0, "T_b": 1e-2, "v_p": 1e-9, "v_p_mean": 1e-7, "Q_H": 100.0,
+    "a": 1e-3, "L": 1e-6, "A_s": 1e-5, "M_s": 1e-2, "N": 1e-4, "v_p_nominal": 1e-9, "Q_H_nominal": 100.0,
+}  # fmt: skip
 """Step of the finite differences, for each number."""
 
 
