@@ -1,7 +1,8 @@
 """Exported C beside Python: ``python -m studies.export``.
 
-Open loop: on the validation crystals that Python grows, the compiled C of each controller gets the same readings, and
-its setpoints are compared with Python's at every sample. Closed loop: the C grows the same crystals itself, and its row
+Open loop: on the validation crystals that Python grows, the compiled C of each controller gets the same readings and
+the same last setpoints, and its setpoints are compared with Python's at every sample. (Left to setpoints of its own, to
+which no crystal answers, a controller of an unstable plant may run away from any rounding error.) Closed loop: the C grows the same crystals itself, and its row
 of the table stands beside Python's.
 """
 
@@ -62,14 +63,18 @@ def rounded(runner: Runner) -> Any:
 
 
 def with_same_readings(block: Block, others: Sequence[Runner]) -> tuple[Any, Any]:
-    """A block that gives others the same readings; and the largest differences of their actions, which it keeps."""
+    """A block that gives others its readings and its setpoints; and the largest differences of their actions, which it
+    keeps.
+    """
     runners, worst = (block, *others), np.zeros(len(others))
 
     def run(inputs: Mapping[str, Any], memory: Any) -> Any:
         done = [runner.run(inputs, its) for runner, its in zip(runners, memory, strict=True)]
         own, *rest = (in_shares(outputs, block.config) for outputs, _ in done)
         np.maximum(worst, [np.abs(each - own).max() for each in rest], out=worst)
-        return done[0][0], tuple(its for _, its in done)
+        own_memory = done[0][1]
+        held = (runner.held_at(its, own_memory.pull, own_memory.heater) for runner, (_, its) in zip(others, done[1:]))
+        return done[0][0], (own_memory, *held)
 
     return SimpleNamespace(start=lambda n: tuple(runner.start(n) for runner in runners), run=run), worst
 

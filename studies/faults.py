@@ -1,11 +1,15 @@
 """Blocks under the faults of a plant: ``python -m studies.faults``.
 
 Every controller's block grows the same crystals without and with each fault: calls that come early, late or unevenly, a
-pyrometer that is gone for two hours, nominal values that are off, drives that stand still. The environment runs at half
+pyrometer that is gone for two hours or drifts, nominal values that are off, drives that stand still or are read wrong,
+a ring that steps or gets stuck. The environment runs at half
 of the block's interval, and the ring's time is that of its frame.
 """
 
+from __future__ import annotations
+
 import argparse
+import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -20,7 +24,7 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.files import check_writable, write_files
 from cz_gym.support.units import HOUR, MINUTE, MM
-from cz_gym.tools.export.block import Alarm
+from cz_gym.tools.export.block import SETPOINT_NAMES, Alarm
 from cz_gym.tools.export.controllers import make_block
 from cz_gym.tools.export.shell import Block, BlockPolicy, Runner
 from cz_gym.tools.export.text import CompiledBlock
@@ -33,8 +37,41 @@ STILL = 1.0 * HOUR, 1.0 * HOUR + 10.0 * MINUTE
 """When the drives stand still [s]."""
 OFF = {"nominal_heater_power_kW": 2.0, "nominal_T_1_K": 10.0, "nominal_radius_mm": 0.2}
 """Errors of the nominal values."""
+STEP = 0.75 * HOUR
+"""When the ring steps or gets stuck [s]."""
+FULL, STEPS = (2.4, 20.0), (0.01, 0.1)
+"""Full ranges of pull speed [mm/min] and heater power [kW], and largest resolutions of their readings."""
+DRIVES = tuple(SETPOINT_NAMES.values())
 SETTLED = 0.5 * HOUR
 """Time from which errors count [s]."""
+
+
+class Reading(NamedTuple):
+    """The errors of a drive's reading, in its unit."""
+
+    scale: float = 1.0
+    offset: float = 0.0
+    resolution: float = 1e-9
+
+    def __call__(self, true: Any) -> Any:
+        """The reading of a drive."""
+        return self.resolution * np.rint((self.scale * np.asarray(true) + self.offset) / self.resolution)
+
+
+def _draws(count: int) -> dict[str, Fault]:
+    """Joint draws of all errors of both readings."""
+    random, draws = np.random.default_rng(1), {}
+    for at in range(1, count + 1):
+        reads = (
+            Reading(
+                random.uniform(0.97, 1.03), 0.02 * full * random.uniform(-1.0, 1.0), random.uniform(0.0, 1.0) * step
+            )
+            for full, step in zip(FULL, STEPS, strict=True)
+        )
+        draws[f"drives read wrong, draw {at}"] = Fault(
+            reads=(next(reads), next(reads)), delay=int(random.integers(0, 3))
+        )
+    return draws
 
 
 class Fault(NamedTuple):
@@ -48,6 +85,16 @@ class Fault(NamedTuple):
     """Error of the nominal values, in multiples of OFF."""
     still: bool = False
     """True if the drives stand still during :data:`STILL`."""
+    reads: tuple[Reading, Reading] | None = None
+    """Errors of the readings of pull speed [mm/min] and heater power [kW]."""
+    delay: int = 0
+    """Age of both, in intervals of the block."""
+    ring: Callable[[Any, Any], Any] | None = None
+    """The ring from :data:`STEP` on, from the true one [mm] and the last one before."""
+    ring_ends: float = math.inf
+    """When it is true again [s]."""
+    drift: float = 0.0
+    """Drift of the pyrometer [K/h]."""
 
 
 UNEVEN = tuple(np.random.default_rng(0).integers(1, 5, 997) / 2.0)
@@ -64,6 +111,23 @@ FAULTS = {
     "nominal values too high": Fault(off=1.0),
     "nominal values too low": Fault(off=-1.0),
     "drives stand still": Fault(still=True),
+    "pull reads 0.97": Fault(reads=(Reading(0.97), Reading())),
+    "pull reads 1.03": Fault(reads=(Reading(1.03), Reading())),
+    "pull reads -2 % of its range": Fault(reads=(Reading(offset=-0.02 * FULL[0]), Reading())),
+    "pull reads +2 % of its range": Fault(reads=(Reading(offset=0.02 * FULL[0]), Reading())),
+    "heater reads 0.97": Fault(reads=(Reading(), Reading(0.97))),
+    "heater reads 0.995": Fault(reads=(Reading(), Reading(0.995))),
+    "heater reads 1.03": Fault(reads=(Reading(), Reading(1.03))),
+    "heater reads -2 % of its range": Fault(reads=(Reading(), Reading(offset=-0.02 * FULL[1]))),
+    "heater reads +2 % of its range": Fault(reads=(Reading(), Reading(offset=0.02 * FULL[1]))),
+    "drives read in steps": Fault(reads=(Reading(resolution=STEPS[0]), Reading(resolution=STEPS[1]))),
+    "drives read two intervals late": Fault(delay=2),
+    **_draws(10),
+    "ring steps by +2 mm": Fault(ring=lambda true, last: true + 2.0),
+    "ring steps by -2 mm": Fault(ring=lambda true, last: true - 2.0),
+    "ring stuck for 10 min": Fault(ring=lambda true, last: last, ring_ends=STEP + 10.0 * MINUTE),
+    "pyrometer drifts by -2 K/h": Fault(drift=-2.0),
+    "pyrometer drifts by -4 K/h": Fault(drift=-4.0),
 }
 
 
@@ -76,6 +140,8 @@ class Faulty:
         self.latency = max(each.sensor.latency for each in block.config.scenario.scenarios)
         self.time, self.calls, self.due, self.bits = 0.0, 0, 0.0, 0
         self.seen: Any = 0.0
+        self.ring: Any = 0.0
+        self.past = list[Any]()
         self.held: dict[str, Any] = {}
 
     def start(self, n: int) -> Any:
@@ -85,15 +151,24 @@ class Faulty:
     def run(self, inputs: Mapping[str, Any], memory: Any) -> Any:
         """The setpoints that reach the plant, and the next memory."""
         time, self.time = self.time, self.time + 0.5 * self.dt
+        self.past.append([inputs[name] for name in DRIVES])
+        late = self.past[max(len(self.past) - 1 - 2 * self.fault.delay, 0)]
+        reads = self.fault.reads or (Reading(), Reading())
+        drives = {name: read(value) for name, read, value in zip(DRIVES, reads, late, strict=True)}
         if time < self.due - 1e-6:
             return self.held, memory
         self.due = time + self.fault.pace[self.calls % len(self.fault.pace)] * self.dt
         self.calls += 1
-        given = dict(inputs) | {"ring_time_s": np.asarray(inputs["time_s"]) - self.latency} | self.off
+        given = dict(inputs) | {"ring_time_s": np.asarray(inputs["time_s"]) - self.latency} | self.off | drives
         if self.fault.pyrometer and GONE[0] <= time < GONE[1]:
             given["T_1_K"] = self.fault.pyrometer(inputs["T_1_K"], self.seen)
         else:
             self.seen = inputs["T_1_K"]
+        given["T_1_K"] = given["T_1_K"] + self.fault.drift * time / HOUR
+        if self.fault.ring and STEP <= time < self.fault.ring_ends:
+            given["ring_radius_mm"] = self.fault.ring(inputs["ring_radius_mm"], self.ring)
+        else:
+            self.ring = inputs["ring_radius_mm"]
         outputs, memory = self.runner.run(given, memory)
         if time > SETTLED:
             self.bits |= int(np.bitwise_or.reduce(outputs["alarms"].astype(np.int64)))
@@ -147,6 +222,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser("python -m studies.faults", "Blocks in compiled C under the faults of a plant.")
     parser.add_argument("--out", type=Path, default=Path("results/faults"), metavar="FOLDER", help="%(default)s")
+    parser.add_argument("--crystals", type=int, default=CRYSTALS, metavar="N", help="test crystals (%(default)s)")
     return parser.run(_main, arguments, "plant")
 
 
@@ -157,9 +233,9 @@ def _main(given: argparse.Namespace) -> None:
         block = make_block(name, make_config("puller", observation="measured", action="direct"))
         runner = CompiledBlock(block)
         for fault in FAULTS:
-            rows[name, fault] = grow(block, fault, CRYSTALS, runner)
+            rows[name, fault] = grow(block, fault, given.crystals, runner)
             print(name, fault, *rows[name, fault], flush=True)
-    write_files({given.out / "report.md": report(rows, CRYSTALS).encode()})
+    write_files({given.out / "report.md": report(rows, given.crystals).encode()})
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from cz_gym.process import scales
 from cz_gym.puller.file import DEFAULT
 from cz_gym.spaces import CLIP, HEATER_SLACK, HISTORY, INTEGRAL_SCALE, LAGGED, MEASURED, drives_of, lags
 from cz_gym.support.errors import CzError, unknown_name_message
-from cz_gym.tools.registry import CONTROLLERS
+from cz_gym.tools.registry import CONTROLLERS, CRYSTAL_CONTROLLERS
 
 from .shell import Block
 
@@ -176,7 +176,10 @@ def make_block(name: str, config: Config) -> Block:
     CzError if there is none of that name, if it cannot be exported, or if an agent is of another puller.
     """
     known = {entry.name: entry for entry in CONTROLLERS if not entry.bound}
+    crystal = {entry.name for entry in CRYSTAL_CONTROLLERS} - known.keys()
     plant = f"Puller {config.puller.label}; plant {config.plant_hash}; control interval {config.control_interval:g} s."
+    if name in crystal:
+        raise CzError(f"{name} cannot be exported: controllers of whole crystals stay in Python")
     if name not in (*known, FALLBACK, *agents.shipped_names()) and Path(name).suffix != ".onnx":
         raise CzError(unknown_name_message("controller or agent", name, [*known, FALLBACK, *agents.shipped_names()]))
     pid, *margins = fallback(config)

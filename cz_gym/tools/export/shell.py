@@ -26,12 +26,13 @@ from cz_gym.body.signals import Measured
 from cz_gym.config import Config
 from cz_gym.spaces import TargetEnv, decode, tag
 from cz_gym.support.errors import select
-from cz_gym.support.units import KILO, MINUTE, MM_PER_MIN
+from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .block import (
     INPUTS,
     OUTPUTS,
     PYROMETER_JUMP,
+    READINGS,
     Alarm,
     Memory,
     PullerConstants,
@@ -41,6 +42,7 @@ from .block import (
     in_plant_units,
     in_shares,
     nominal_puller,
+    readings_of,
     sample_of,
     settings_are_sane,
     settings_of,
@@ -54,13 +56,18 @@ DRIVE_ERROR_TIME = MINUTE
 PULL_BIAS_TIME, TRIM_T_1, TRIM_Q_H = 5.0 * MINUTE, 0.5, 0.005
 """Averaging time of the pull speed [s]; what a takeover leaves of the deviation from the nominal temperature [K] and
 power [share of the heater's range]. The rest counts as an error of the nominal values."""
+READING_ERROR_TIME, LIMITED = 5.0 * MINUTE, 0.5
+"""Time after which an error of a drive's reading counts [s]; mean side of the cuts, averaged over PULL_BIAS_TIME, from
+which limiting does [-]. What noise cuts on both sides is no limiting."""
+FAR_PULL = 0.05
+"""Relative deviation of the pull speed from nominal with which a takeover begins with the PID [-]."""
 SETTLED_TIME = 30.0 * MINUTE
 """Time since a takeover or a bad pyrometer, from which it counts that a model does not explain the readings [s]."""
 SLOWER, FOLLOWED = 1.5, 0.5
 """Heater without a pyrometer: time constant of the mean pull speed, in multiples of its averaging time, and share of
 the recipe's movement that is followed [-]."""
 TEMPERATURES = "T_1", "T_2", "T_b"
-UNKNOWN = "clock_s", "called_s", "pull", "heater", "last_T_1"
+UNKNOWN = "clock_s", "called_s", "pull", "heater", "sent_pull", "sent_heater", "last_T_1", "last_ring", "ring_level"
 """Fields of :class:`.block.Memory` that are infinite before the first sample."""
 
 
@@ -89,78 +96,116 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     """
     dt, sane, call = constants.dt, settings_are_sane(given), call_of(constants.dt, given, memory)
     automatic, before = (given["automatic"] > 0.5) & sane, (memory.engaged > 0.5) & ~call.starts
-    seen = sample_of(constants, call, ~(automatic & before), given, memory)
-    drives = [drive_of(sane, constants, call, seen, given, memory, which) for which in (0, 1)]
+    raw, plausible = readings_of(given, constants.ranges)
+    drives = [drive_of(sane, constants, call, before, plausible, given, memory, which) for which in (0, 1)]
     known = drives[0].known & drives[1].known
     engaged = automatic & (before | known)
     runs = engaged & before
     away = runs & (drives[0].away | drives[1].away)
     held_error = np.where(away, memory.drive_error_time + dt, 0.0)
     drive_error_time = np.where(call.later, memory.drive_error_time, held_error)
-    good = seen.ring & seen.reference & known
+    lost = drive_error_time > DRIVE_ERROR_TIME
+    follows = runs & ~lost
+    # Setpoints that a takeover read wrong are set right once, when that has shown; then the controller begins.
+    takeover, unsure = given["takeover_s"], ~runs | (memory.unsure > 0.5)
+    corrects = runs & unsure & (takeover > 0.0) & (2.0 * (memory.since_takeover + dt) >= takeover)
+    told_drives = {
+        name: np.where(runs, (each.told(follows, corrects) - given[nominal]) * unit, getattr(raw, name))
+        for each, (name, (_, nominal, _, unit)) in zip(drives, list(READINGS.items())[-2:], strict=True)
+    }
+    trusted = plausible._replace(v_p=plausible.v_p | follows, Q_H=plausible.Q_H | follows)
+    seen = sample_of(constants, call, ~(automatic & before), given, memory, raw._replace(**told_drives), trusted)
+    good = seen.ring.good & seen.reference & known
     bad_readings_time = np.where(good, 0.0, np.where(call.starts, 0.0, memory.bad_readings_time) + dt)
     no_pyrometer_time = np.where(seen.pyrometer, 0.0, np.where(call.starts, 0.0, memory.no_pyrometer_time) + dt)
-    settled_time = np.where(runs & seen.pyrometer, memory.settled_time + dt, 0.0)
+    settled_time = np.where(runs & seen.pyrometer & (memory.fallback < 0.5), memory.settled_time + dt, 0.0)
     check = getattr(controller, "model_mismatch", None)
     mismatch = (settled_time > SETTLED_TIME) & (check(memory.controller) if check else False)
-    fallen = runs & (memory.fallback > 0.5)
-    fallback = runs & (fallen | (bad_readings_time > given["fallback_after_s"]) | mismatch)
-    since_takeover = np.where(runs & (fallen | ~fallback), memory.since_takeover + dt, 0.0)
-    authority = np.minimum(since_takeover / np.maximum(given["takeover_s"], 1e-3), 1.0)
+    fallen, wait = runs & (memory.fallback > 0.5), given["return_after_s"]
+    distance = np.abs(seen.ring.level - seen.read.r_ref)
+    beyond = engaged & finite(seen.ring.level) & (distance > given["radius_limit_mm"] * MM)
+    calm = (2.0 * distance < given["radius_limit_mm"] * MM) & (np.abs(memory.pull_bias) < FAR_PULL)
+    good_time = np.where(fallen & good & seen.pyrometer & calm, memory.good_time + dt, 0.0)
+    # What an operator leaves far from nominal is brought back by the PID.
+    far = beyond | (np.abs(raw.v_p) > FAR_PULL * given["nominal_pull_speed_mm_per_min"] * MM_PER_MIN)
+    begins_far = engaged & ~runs & far & (wait > 0.0)
+    returns = fallen & (memory.stays < 0.5) & (wait > 0.0) & (good_time >= wait)
+    fallback = runs & ~returns & (fallen | (bad_readings_time > given["fallback_after_s"]) | mismatch)
+    since_takeover = np.where(fallback & ~fallen | returns, 0.5 * takeover, memory.since_takeover + dt)
+    since_takeover = np.where(runs, since_takeover, 0.0)
+    authority = np.clip(2.0 * since_takeover / np.maximum(takeover, 1e-3) - 1.0, 0.0, 1.0)
 
     # Errors of the nominal values, as the takeover finds them, are taken off all later readings.
     at_takeover = np.where(seen.pyrometer, _excess(seen.read.T_1, TRIM_T_1), 0.0)
     T_1_offset = np.where(runs, memory.T_1_offset, at_takeover)
-    Q_H_offset = np.where(runs, memory.Q_H_offset, _excess(seen.read.Q_H, TRIM_Q_H * constants.ranges[1]))
+    Q_H_offset = np.where(runs & ~corrects, memory.Q_H_offset, _excess(seen.read.Q_H, TRIM_Q_H * constants.ranges[1]))
     temperatures = {n: getattr(seen.read, n) - T_1_offset for n in Measured._fields if n.startswith("T_1")}
     read = seen.read._replace(**temperatures, Q_H=seen.read.Q_H - Q_H_offset)
     nominal = drives[0].nominal, drives[1].nominal + Q_H_offset / KILO
     estimates = controller.accepts_missing_temperature
     # The samples of a call have one frame in common, whose noise counts once.
     told = read._replace(T_1=np.where(call.again, np.inf, seen.T_1 - T_1_offset), valid=read.valid / call.samples)
-    held = memory.controller if runs.all() else select(runs, memory.controller, controller.at_rest(read))
+    goes_on = runs & ~returns & ~corrects
+    held = memory.controller if goes_on.all() else select(goes_on, memory.controller, controller.at_rest(read))
     own = controller.step(told if estimates else read, held)
     other = own[0], own[1], memory.pid
     if (fallback | ~(finite(own[0]) & finite(own[1]))).any():
-        other = pid.step(read, select(fallen, memory.pid, pid.at_rest(read)))
+        other = pid.step(read, select(fallen & (memory.unsure < 0.5), memory.pid, pid.at_rest(read)))
     pull, heater = (
         np.where(fallback, second, first) / unit + at
         for first, second, unit, at in zip(own[:2], other[:2], (MM_PER_MIN, KILO), nominal, strict=True)
     )
 
-    lost = drive_error_time > DRIVE_ERROR_TIME
     old = [np.where(runs, each.near(each.held, lost), each.applied) for each in drives]
     bias = np.where(call.starts, 0.0, memory.pull_bias)
     bias = bias + min(dt / PULL_BIAS_TIME, 1.0) * (seen.read.v_p / (drives[0].nominal * MM_PER_MIN) - bias)
     blind = ~seen.pyrometer & ((no_pyrometer_time > NO_PYROMETER_TIME) | fallback | (not estimates))
     moved = np.where(seen.reference & ~call.starts, seen.read.T_1_ref - memory.readings.T_1_ref, 0.0)
     trim = FOLLOWED * constants.feed * moved + constants.trim * (bias - memory.pull_bias + dt / constants.slow * bias)
-    wanted = np.where(fallback & ~seen.ring, old[0], pull), np.where(blind, old[1] + trim / KILO, heater)
+    wanted = np.where(fallback & ~seen.ring.good, old[0], pull), np.where(blind, old[1] + trim / KILO, heater)
     sound = finite(wanted[0]) & finite(wanted[1])
     moves = [
         each.move(start, np.where(sound, target, start), authority, dt)
         for each, start, target in zip(drives, old, wanted, strict=True)
     ]
+    sides = [
+        np.where(runs, mean + min(dt / PULL_BIAS_TIME, 1.0) * (side - mean), 0.0)
+        for mean, (_, side) in zip((memory.pull_limited, memory.heater_limited), moves, strict=True)
+    ]
+    erring = runs & (drives[0].errs | drives[1].errs)
+    reading_error_time = np.where(erring, memory.reading_error_time + dt, 0.0)
+    radius_time = np.where(beyond, memory.radius_time + dt, 0.0)
     setpoints = [
         np.where(call.due, np.where(engaged, each.near(value, lost), each.applied), each.held)
         for each, (value, _) in zip(drives, moves, strict=True)
     ]
     bits = {
-        Alarm.RING: ~seen.ring, Alarm.PYROMETER: ~seen.pyrometer, Alarm.DRIVES: ~known,
+        Alarm.RING: ~seen.ring.good, Alarm.PYROMETER: ~seen.pyrometer, Alarm.DRIVES: ~known,
         Alarm.REFERENCE: ~seen.reference, Alarm.LATE: call.late, Alarm.CLOCK: ~call.sound,
-        Alarm.PULL_LIMITED: engaged & moves[0][1], Alarm.HEATER_LIMITED: engaged & moves[1][1],
+        Alarm.PULL_LIMITED: np.abs(sides[0]) > LIMITED, Alarm.HEATER_LIMITED: np.abs(sides[1]) > LIMITED,
         Alarm.TAKEOVER: engaged & (authority < 1.0), Alarm.FALLBACK: fallback, Alarm.FAILED: engaged & ~sound,
         Alarm.MANUAL: ~engaged, Alarm.SETTINGS: ~sane, Alarm.ASTRAY: lost, Alarm.MODEL: mismatch,
+        Alarm.READING_ERROR: reading_error_time > READING_ERROR_TIME, Alarm.RING_STEP: seen.ring.stepped,
+        Alarm.RADIUS: radius_time > given["radius_limit_s"],
     }  # fmt: skip
     alarms = reduce(add, (np.where(holds, float(bit), 0.0) for bit, holds in bits.items()))
-    outputs = dict(zip((port.name for port in OUTPUTS), (*setpoints, alarms), strict=True))
+    errors = (np.where(runs, each.error, 0.0) for each in drives)
+    outputs = dict(zip((port.name for port in OUTPUTS), (*setpoints, alarms, *errors), strict=True))
+    stays = np.where(fallback & ((memory.stays > 0.5) | mismatch) | (engaged & ~sound), 1.0, 0.0)
     now = Memory(
-        clock_s=call.clock, called_s=given["time_s"], late=np.where(call.late, 1.0, 0.0),
-        samples=call.samples, engaged=np.where(engaged, 1.0, 0.0), since_takeover=since_takeover,
-        bad_readings_time=bad_readings_time, fallback=np.where(fallback | (engaged & ~sound), 1.0, 0.0),
-        pull=setpoints[0], heater=setpoints[1], drive_error_time=drive_error_time, last_T_1=seen.last_T_1,
-        frozen_time=seen.frozen_time, no_pyrometer_time=no_pyrometer_time, pull_bias=bias, settled_time=settled_time,
-        T_1_offset=T_1_offset, Q_H_offset=Q_H_offset, readings=seen.read, controller=own[2], pid=other[2],
+        clock_s=call.clock, called_s=given["time_s"], late=np.where(call.late, 1.0, 0.0), samples=call.samples,
+        engaged=np.where(engaged, 1.0, 0.0), since_takeover=since_takeover, bad_readings_time=bad_readings_time,
+        fallback=np.where(fallback | begins_far | (engaged & ~sound), 1.0, 0.0), pull=setpoints[0],
+        heater=setpoints[1], drive_error_time=drive_error_time, last_T_1=seen.last_T_1,
+        frozen_time=seen.frozen_time, no_pyrometer_time=no_pyrometer_time, pull_bias=bias,
+        settled_time=settled_time, T_1_offset=T_1_offset, Q_H_offset=Q_H_offset, unsure=np.where(unsure &
+        ~corrects, 1.0, 0.0), sent_pull=drives[0].sent, sent_heater=drives[1].sent,
+        pull_difference=drives[0].difference, heater_difference=drives[1].difference,
+        reading_error_time=reading_error_time, pull_limited=sides[0], heater_limited=sides[1],
+        good_time=good_time, stays=stays, last_ring=seen.ring.last, ring_still_time=seen.ring.still_time,
+        no_ring_time=seen.ring.gone_time, ring_level=seen.ring.level, ring_offset=seen.ring.offset,
+        ring_step=seen.ring.step, ring_step_time=seen.ring.step_time, radius_time=radius_time,
+        readings=seen.read, controller=own[2], pid=other[2],
     )  # fmt: skip
     return outputs, now, call.due, call.again
 
@@ -210,6 +255,11 @@ class Block:
                 break
         return outputs, memory
 
+    @staticmethod
+    def held_at(memory: Memory, pull: Any, heater: Any) -> Memory:
+        """The memory with other last setpoints [mm/min, kW], from which the next ones move."""
+        return memory._replace(pull=pull, heater=heater)
+
     @cached_property
     def constants(self) -> PullerConstants:
         """Constants of the puller compiled into the block."""
@@ -246,6 +296,9 @@ class Runner(Protocol):
 
     def run(self, inputs: Mapping[str, Any], memory: Any) -> tuple[dict[str, Floats], Any]:
         """The outputs, each of shape (n,), and the next memory."""
+
+    def held_at(self, memory: Any, pull: Any, heater: Any) -> Any:
+        """The memory with other last setpoints [mm/min, kW]."""
 
 
 class BlockState(NamedTuple):

@@ -160,6 +160,13 @@ class CompiledBlock:
             self._step(*(start + i * size for start, size in places))
         return {name: setpoints[name].astype(np.float64) for name in setpoints.dtype.names or ()}, memory
 
+    @staticmethod
+    def held_at(memory: Any, pull: Any, heater: Any) -> Any:
+        """The memory with other last setpoints [mm/min, kW]."""
+        memory = memory.copy()
+        memory["pull"][:, 0], memory["heater"][:, 0] = pull, heater
+        return memory
+
 
 SAMPLES = 240
 """Calls of a test vector."""
@@ -186,8 +193,9 @@ def test_vector(block: Block) -> str:
         given |= {"T_1_K": np.nan} if 120 <= k < 130 else {}
         given |= {"pull_speed_mm_per_min": pull, "heater_power_kW": heater}
         outputs, memory = block.run(given, memory)
-        pull, heater, alarms = (float(outputs[port.name][0]) for port in OUTPUTS)
-        lines.append(",".join(f"{value:.17g}" for value in (*given.values(), pull, heater, alarms)))
+        shown = [float(outputs[port.name][0]) for port in OUTPUTS]
+        pull, heater = shown[:2]
+        lines.append(",".join(f"{value:.17g}" for value in (*given.values(), *shown)))
     return "\n".join(lines) + "\n"
 
 
@@ -204,7 +212,7 @@ def setpoints_on_log(block: Block, log: Any) -> tuple[Floats, Floats]:
         drives = log.v_p[k] / MM_PER_MIN, log.Q_H[k] / KILO
         given |= {"pull_speed_mm_per_min": drives[0], "heater_power_kW": drives[1], "T_1_K": log.T_1[k]}
         given |= {"time_s": time, "ring_time_s": time, "ring_radius_mm": log.ring[k] / MM}
-        memory = memory._replace(pull=np.full(1, drives[0]), heater=np.full(1, drives[1]))
+        memory = block.held_at(memory, np.full(1, drives[0]), np.full(1, drives[1]))
         outputs, memory = block.run(given | {"valid": float(np.isfinite(log.ring[k]))}, memory)
         rows.append([outputs[port.name][0] for port in OUTPUTS])
     outputs_of_rows = np.array(rows)

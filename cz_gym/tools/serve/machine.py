@@ -177,6 +177,13 @@ class Tag(NamedTuple):
     writable: bool = False
 
 
+SHOWN_SETTINGS = {
+    "ring_bias_mm",
+    *(f"nominal_{name}" for name in ("radius_mm", "pull_speed_mm_per_min", "heater_power_kW", "T_1_K")),
+    *(f"pull_speed_{end}_mm_per_min" for end in ("min", "max")),
+    *(f"heater_power_{end}_kW" for end in ("min", "max")),
+}
+"""The settings of an exported block that clients see as tags."""
 TAGS = (
     Tag("time_s", float, "time since the crystal's start"),
     Tag("state", str, "growing, or how the crystal ended"),
@@ -185,7 +192,7 @@ TAGS = (
     *(Tag(port.name, bool if port.logical else float, port.meaning) for port in INPUTS[2:-1]),
     *(Tag(port.name, float, port.meaning, True) for port in OUTPUTS[:2]),
     Tag("watchdog", int, "number of the step that the setpoints answer; writing it makes them act", True),
-    *(Tag(port.name, float, port.meaning) for port in settings_of(Config())[:9]),
+    *(Tag(port.name, float, port.meaning) for port in settings_of(Config()) if port.name in SHOWN_SETTINGS),
     Tag("control_interval_s", float, "length of a step"),
     Tag("watchdog_s", float, "time after which setpoints that are not renewed give way to the fallback"),
     Tag("scenario", str, "the scenario"),

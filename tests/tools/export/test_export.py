@@ -23,7 +23,7 @@ from cz_gym.env import CzVectorEnv
 from cz_gym.spaces import DRIVE_CHANNELS, HEATER_RANGE, decode, drives_of, readable
 from cz_gym.support.errors import CzError
 from cz_gym.tools.export import controllers
-from cz_gym.tools.export.block import INPUTS, Alarm, in_plant_units, in_shares, nominal_puller
+from cz_gym.tools.export.block import INPUTS, OUTPUTS, Alarm, in_plant_units, in_shares, nominal_puller
 from cz_gym.tools.export.command import main, readme
 from cz_gym.tools.export.controllers import identifier_of, make_block, network_of
 from cz_gym.tools.export.shell import BlockPolicy
@@ -65,6 +65,10 @@ class StBlock:
         outputs = memory(**{name: float(np.ravel(value)[0]) for name, value in inputs.items()})
         return {name: np.full(1, float(value)) for name, value in outputs.items()}, memory
 
+    def held_at(self, memory, pull, heater):
+        memory.space |= {"pull": float(pull[0]), "heater": float(heater[0])}
+        return memory
+
 
 LANGUAGES = [
     pytest.param(lambda block: block, id="python"),
@@ -83,7 +87,7 @@ class Plant:
     """A block, called at times of the test's own, in Python or in another language."""
 
     def __init__(self, name="paper-tuned", runner=lambda block: block, **changed):
-        self.block, self.changed = block_of(name), changed
+        self.block, self.changed = block_of(name), {"ring_still_s": 1e9, "takeover_s": 60.0} | changed
         self.runner = runner(self.block)
         self.memory = self.runner.start(1)
         self.time = 0.0
@@ -111,9 +115,11 @@ def test_an_exported_agent_acts_as_onnxruntime_does(name):
     for k in range(120):
         action, state = policy.predict(seen, state)
         inputs = twin.inputs(np.asarray(measured, np.float64), np.full(n, k))
+        memory = memory._replace(pull=inputs["pull_speed_mm_per_min"], heater=inputs["heater_power_kW"])
         outputs, memory = block.run(inputs | {"takeover_s": 0.0}, memory)
         if k:
-            applied, gains = measured[:, DRIVE_CHANNELS].astype(np.float64), np.array([drives.pull, drives.heater])
+            gains = np.array([drives.pull, drives.heater])
+            applied = measured[:, DRIVE_CHANNELS].astype(np.float64)
             wanted = np.clip(drives.keep * applied + gains * np.asarray(action), -1.0, 1.0)
             assert (twin.action_of(outputs) - wanted) / gains == pytest.approx(0.0, abs=1e-4)
         seen, measured = own.step(np.asarray(action))[0], env.step(np.asarray(action))[0]
@@ -134,7 +140,8 @@ SLOW += [
 def test_a_block_is_its_controller_in_every_language(name, scenario):
     """Within 1e-9, in single precision within 1e-5, on crystals that Python grows; structured text runs the first.
 
-    Every controller of the registry either does so or is refused.
+    Every controller of the registry either does so or is refused. All move from Python's last setpoints: left to its
+    own, to which no crystal answers, a controller of an unstable plant may run away from any rounding error.
     """
     config, n = config_of(scenario), 3
     controller = make_controller(name, config) if name in CLASSICAL else None
@@ -145,13 +152,17 @@ def test_a_block_is_its_controller_in_every_language(name, scenario):
     block, state, last = block_of(name, scenario), None, None
     runners = [block, CompiledBlock(block), StBlock(block), CompiledBlock(block, single=True)]
     policy, memories = BlockPolicy(block), [runner.start(n) for runner in runners]
+    free = {"takeover_s": 0.0, "pull_speed_min_mm_per_min": 0.0, "pull_speed_max_mm_per_min": 2.4}
+    free |= {"pull_slew_mm_per_min2": 1e30, "heater_slew_kW_per_min": 1e30}
     env = CzVectorEnv.from_config(config, n)
     observation, _ = env.reset(seed=list(range(n)))
     for k in range(100):
-        inputs = policy.inputs(np.asarray(observation, np.float64), np.full(n, k)) | {"takeover_s": 0.0}
+        inputs = policy.inputs(np.asarray(observation, np.float64), np.full(n, k)) | free
         done = [runner.run(inputs, memory) for runner, memory in zip(runners, memories, strict=True)]
-        memories = [memory for _, memory in done]
+        held = done[0][1].pull, done[0][1].heater
+        memories = [runner.held_at(memory, *held) for runner, (_, memory) in zip(runners, done, strict=True)]
         own, c, st, single = (outputs for outputs, _ in done)
+        read = memories[0].readings  # what the shell tells: setpoints as applied drives, no outliers of the ring
         action = in_shares(own, config)
         for found, tolerance in ((c, 1e-9), (st, 1e-9), (single, 1e-5)):
             rows = len(found[PULL])
@@ -161,6 +172,9 @@ def test_a_block_is_its_controller_in_every_language(name, scenario):
         if controller is not None:
             seen = decode(np.asarray(observation, np.float64))
             last = readable(seen, seen if last is None else last)
+            last = last._replace(
+                v_p=read.v_p, v_p_mean=read.v_p_mean, Q_H=read.Q_H, ring_error=read.ring_error, valid=read.valid
+            )
             state = controller.at_rest(last) if state is None else state
             pull, heat, state = controller.step(last._replace(T_1=seen.T_1), state)
             wanted = np.clip(np.stack([pull / config.parameters.v_0, heat / HEATER_RANGE], axis=-1), -1.0, 1.0)
@@ -195,10 +209,10 @@ def test_the_test_vector_is_what_every_language_computes(name, runner):
     memory = other.start(1)
     for row in rows:
         given = dict(zip(head, map(float, row), strict=True))
-        expected = [given.pop(name) for name in (PULL, HEATER, ALARMS)]
+        expected = {port.name: given.pop(port.name) for port in OUTPUTS}
         outputs, memory = other.run(given, memory)
-        assert [float(outputs[name][0]) for name in (PULL, HEATER, ALARMS)] == pytest.approx(expected, abs=1e-9)
-        alarms |= int(expected[2])
+        assert {name: float(outputs[name][0]) for name in expected} == pytest.approx(expected, abs=1e-9)
+        alarms |= int(expected[ALARMS])
     assert Alarm.LATE | Alarm.FALLBACK | Alarm.PYROMETER | Alarm.RING | Alarm.TAKEOVER | Alarm.MANUAL in Alarm(alarms)
 
 
@@ -250,6 +264,15 @@ def test_faults_lose_no_crystal(fault):
     block = block_of("paper-tuned")
     row = grow(block, fault, 2, CompiledBlock(block), 7200.0)
     assert row.lost == row.helpless
+
+
+@needs_compiler
+@pytest.mark.parametrize("fault", ["heater reads 1.03", "drives read wrong, draw 1", "ring steps by -2 mm"])
+def test_readings_that_err_cost_no_radius(fault):
+    block = block_of("paper-tuned")
+    exact, row = (grow(block, each, 3, CompiledBlock(block), 5400.0) for each in ("none", fault))
+    assert row.lost == 0
+    assert row.rmse < 1.2 * exact.rmse
 
 
 def test_a_shadow_runs_beside_a_log(tmp_path):
@@ -374,8 +397,8 @@ def test_the_samples_of_a_late_call_see_ring_and_drives_on_their_way():
         moved = {"ring_radius_mm": 0.3 * late, "pull_speed_mm_per_min": 0.06 * late, "heater_power_kW": 0.3 * late}
         given = {name: rest[name] + value for name, value in moved.items()} | {"time_s": time, "ring_time_s": time}
         _, memory = watched.run(rest | given, memory)
-    thirds = np.array([1.0, 2.0, 3.0])
-    assert np.array(told[-3:])[:, :3] == pytest.approx(np.outer(thirds, [1e-4, 0.02 / 6e4, 100.0]), abs=1e-9)
+    assert np.array(told[-3:])[:, 0] == pytest.approx(1e-4 * np.array([1.0, 2.0, 3.0]), abs=1e-9)
+    assert np.array(told[-3:])[:, 1:3] == pytest.approx(0.0, abs=1e-3)  # setpoints, not their readings
     assert np.isfinite(told)[-3:, 3].tolist() == [False, False, True]
     assert [each[4] for each in told] == pytest.approx([1.0] * 3 + [1.0 / 3.0] * 3)
 
@@ -387,7 +410,8 @@ def test_an_lqg_knows_less_of_the_radius_when_it_is_called_late():
     def variance(pace):
         memory = block.start(1)
         for time in np.arange(0.0, 600.0, pace):
-            _, memory = block.run(nominal({"time_s": time, "ring_time_s": time}), memory)
+            given = {"time_s": time, "ring_time_s": time, "ring_still_s": 1e9}
+            _, memory = block.run(nominal(given), memory)
         return memory.controller.filter.covariance[0, 0, 0]
 
     assert variance(15.0) > 1.2 * variance(5.0)
@@ -442,7 +466,8 @@ def test_the_clock_is_watched_and_no_sample_is_taken_twice():
 
 def test_ranges_and_slew_rates_hold():
     """Of drives that follow, with a pyrometer that is alive."""
-    plant = Plant("paper", pull_slew_mm_per_min2=0.3, heater_slew_kW_per_min=1.0, pull_speed_max_mm_per_min=1.5)
+    limits = {"heater_slew_kW_per_min": 1.0, "pull_speed_max_mm_per_min": 1.5, "ring_step_mm": 1e3}
+    plant = Plant("paper", pull_slew_mm_per_min2=0.3, **limits)
     rng, outputs, alarms = np.random.default_rng(0), {PULL: 1.2, HEATER: 57.6}, Alarm(0)
     for _ in range(200):
         before, T_1 = outputs, 1785.6 + rng.normal(0.0, 0.1)
@@ -452,7 +477,7 @@ def test_ranges_and_slew_rates_hold():
         assert abs(outputs[HEATER] - before[HEATER]) <= 1.0 / 12.0 + 1e-12
         assert outputs[PULL] <= 1.5
         alarms |= Alarm(int(outputs[ALARMS]))
-    assert alarms == Alarm.TAKEOVER | Alarm.PULL_LIMITED | Alarm.HEATER_LIMITED
+    assert alarms == Alarm.TAKEOVER | Alarm.HEATER_LIMITED  # noise cuts the pull on both sides
     assert outputs[HEATER] == pytest.approx(plant.block.ports["heater_power_max_kW"].default)
 
 
@@ -495,12 +520,12 @@ def test_without_drives_the_set_nominal_values_hold_and_wrong_settings_refuse_to
 
 @pytest.mark.parametrize("runner", LANGUAGES)
 def test_drives_that_do_not_follow_raise_a_bit_and_are_taken_as_applied(runner):
-    plant = Plant("paper-tuned", runner)
+    plant = Plant("paper-tuned", runner, return_after_s=0.0)
     alarms = [plant.alarms(ring_radius_mm=104.0, pull_speed_mm_per_min=1.2) for _ in range(120)]
     assert Alarm.ASTRAY not in alarms[10]
     assert Alarm.ASTRAY in alarms[-1]
     assert Alarm.FALLBACK not in alarms[-1]
-    assert abs(plant(ring_radius_mm=104.0)[PULL] - 1.2) <= 0.25
+    assert abs(plant(ring_radius_mm=104.0)[PULL] - 1.2) <= 0.25 + 0.084  # an error of the reading is allowed for
 
 
 @pytest.mark.parametrize("runner", LANGUAGES)
@@ -538,6 +563,7 @@ def test_the_command_writes_a_folder(name, to, files, tmp_path):
         ("nobody --to c", "unknown controller or agent 'nobody'"),
         ("lqg-true --to c", "unknown"),
         ("open-loop --to c", "cannot be exported"),
+        ("compensated --to c", "controllers of whole crystals stay in Python"),
         ("lqg-at-0.02-adaptive --to c", "cannot be exported"),
         ("paper-tuned --to c", "is of another block"),
         ("paper --to st --puller germanium", "is of another block"),
