@@ -2,8 +2,8 @@
 
 Open loop: on the validation crystals that Python grows, the compiled C of each controller gets the same readings and
 the same last setpoints, and its setpoints are compared with Python's at every sample. (Left to setpoints of its own, to
-which no crystal answers, a controller of an unstable plant may run away from any rounding error.) Closed loop: the C grows the same crystals itself, and its row
-of the table stands beside Python's.
+which no crystal answers, a controller of an unstable plant may run away from any rounding error.) Closed loop: the C
+grows the same crystals itself, and its row of the table stands beside Python's.
 """
 
 import argparse
@@ -72,9 +72,9 @@ def with_same_readings(block: Block, others: Sequence[Runner]) -> tuple[Any, Any
         done = [runner.run(inputs, its) for runner, its in zip(runners, memory, strict=True)]
         own, *rest = (in_shares(outputs, block.config) for outputs, _ in done)
         np.maximum(worst, [np.abs(each - own).max() for each in rest], out=worst)
-        own_memory = done[0][1]
-        held = (runner.held_at(its, own_memory.pull, own_memory.heater) for runner, (_, its) in zip(others, done[1:]))
-        return done[0][0], (own_memory, *held)
+        outputs, its = done[0]
+        pairs = zip(others, done[1:], strict=True)
+        return outputs, (its, *(each.held_at(memory, its.pull, its.heater) for each, (_, memory) in pairs))
 
     return SimpleNamespace(start=lambda n: tuple(runner.start(n) for runner in runners), run=run), worst
 

@@ -148,6 +148,10 @@ class Faulty:
         """The memory of n blocks before their first sample."""
         return self.runner.start(n)
 
+    def held_at(self, memory: Any, pull: Any, heater: Any) -> Any:
+        """The memory with other last setpoints [mm/min, kW]."""
+        return self.runner.held_at(memory, pull, heater)
+
     def run(self, inputs: Mapping[str, Any], memory: Any) -> Any:
         """The setpoints that reach the plant, and the next memory."""
         time, self.time = self.time, self.time + 0.5 * self.dt
