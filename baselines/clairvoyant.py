@@ -16,7 +16,7 @@ import numpy.typing as npt
 from cz_gym.body.signals import beyond_band, coefficients, moved_mean, newest_share
 from cz_gym.config import Config
 from cz_gym.engine.batch import Key, first_key
-from cz_gym.episodes.draw import episode_from_key, factors_from_key, new_series, randomised
+from cz_gym.episodes.draw import Episode, episode_from_key, factors_from_key, new_series, randomised
 from cz_gym.episodes.scenario import GRID, Actuators
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.plant import (
@@ -73,10 +73,9 @@ def pullers_of(config: Config, seeds: Sequence[int]) -> tuple[Puller, ...]:
     return tuple(pullers)
 
 
-def fluctuations_of(config: Config, seeds: Sequence[int]) -> tuple[tuple[float, float], ...]:
-    """Standard deviations of the fast and the slow interface fluctuation [K] in the first episode of each seed."""
-    drawn = (episode_from_key(config.sole_scenario, key, new_series(1, 0)) for key in _keys(seeds))
-    return tuple((float(episode.sd_fast), float(episode.sd_slow)) for episode in drawn)
+def episodes_of(config: Config, seeds: Sequence[int]) -> tuple[Episode, ...]:
+    """The constants of the first episode of each seed."""
+    return tuple(episode_from_key(config.sole_scenario, key, new_series(1, 0)) for key in _keys(seeds))
 
 
 def future_of(config: Config, seeds: Sequence[int]) -> Future:
@@ -373,6 +372,7 @@ class Clairvoyant:
             )
         p = future.puller
         state_0, inputs_0 = (np.stack(np.broadcast_arrays(*values), axis=-1) for values in (p.state_0, p.inputs_0))
+        inputs_0[:, 1] += [each.told_power for each in episodes_of(config, seeds)]
         return OptimalInputs(best, state_0, inputs_0, np.array(config.ranges), config.made_for)
 
 
@@ -384,7 +384,7 @@ class OptimalInputs:
     state_0: Floats
     """Each puller's operating point, shape (n, 5)."""
     inputs_0: Floats
-    """Inputs at the operating point, shape (n, 2)."""
+    """Inputs that actions count from, shape (n, 2)."""
     ranges: Floats
     """Range of an action: pull speed [m/s] and heater power [W] that 1 stands for."""
     made_for: TargetEnv

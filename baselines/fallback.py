@@ -22,7 +22,7 @@ from cz_gym.support.errors import CzError
 from cz_gym.support.units import MM, MM_PER_MIN
 
 from .analysis import close, linear_form
-from .lqg_filter import MEAN_RIPPLE
+from .lqg_filter import ripple_left
 from .margins import margin_of, worst_of
 from .pid import FilteredPID, SeriesPID
 from .policy import Floats
@@ -85,7 +85,7 @@ def fallback(config: Config) -> Fallback:
         replace(config, scenario=scenarios[0], horizon=config.control_interval),
         max(each.latency for each in sensors),
         min(config.parameters.v_0, *(each.actuators.pull_window for each in scenarios)),
-        max(math.hypot(np.mean(each.camera_noise), MEAN_RIPPLE * each.ripple[1]) for each in sensors),
+        max(math.hypot(np.mean(each.camera_noise), ripple_left(each)) for each in sensors),
     )
 
 

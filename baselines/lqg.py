@@ -25,7 +25,7 @@ from cz_gym.spaces import STATE, tag
 from cz_gym.support.errors import stack
 from cz_gym.support.units import KILO, MM_PER_MIN
 
-from .clairvoyant import fluctuations_of, pullers_of
+from .clairvoyant import episodes_of, pullers_of
 from .lqg_estimator import Hypotheses, MultipleModelFilter, PlantFilter, multiple_model_filter
 from .lqg_filter import (
     DRIFT,
@@ -142,6 +142,8 @@ class LQGDesign:
     """Weights of the regulator's quadratic cost, whose term of the pull speed has no band."""
     lam: float = 0.5
     """Share of conduction at the design point [-]."""
+    R: float = 0.0
+    """Boundary layer that it expects under the crystal, beside the puller's own [m2 K/W]."""
     nonlinear: bool = True
     """Predicts with the plant's equations; False: with the linearised ones."""
     gate: float = 4.0
@@ -225,7 +227,8 @@ class LQG(MeasuredController):
     @cached_property
     def gains(self) -> LQGGains:
         """Gains of the design point."""
-        puller = make_puller(self.parameters, self.design.lam, self.meniscus)
+        parameters = self.parameters._replace(R=self.parameters.R + self.design.R)
+        puller = make_puller(parameters, self.design.lam, self.meniscus)
         return solve(self.design, self.control_interval, puller, self.meniscus)
 
     def estimator(self, n: int) -> PlantFilter | MultipleModelFilter:
@@ -299,6 +302,8 @@ class PrivilegedLQG(LQG):
     """
 
     gains_by_slot: LQGGains | None = None
+    told: tuple[Floats, Floats] = (np.zeros(1), np.zeros(1))
+    """Nominal power [W] and temperature [K] that controllers are told, minus the puller's own, each of shape (n,)."""
     knows_fluctuations: bool = False
 
     @cached_property
@@ -315,13 +320,25 @@ class PrivilegedLQG(LQG):
 
     def for_episodes(self, config: Config, seeds: Sequence[int]) -> Self:
         """Return the controller that knows those episodes, one a slot."""
-        designs = [self.design] * len(seeds)
+        drawn = episodes_of(config, seeds)
+        exact = replace(self.design.noise, told_power_sd=0.0, told_temperature_sd=0.0)
+        designs = [replace(self.design, noise=exact)] * len(seeds)
         if self.knows_fluctuations:
-            sds = np.maximum(fluctuations_of(config, seeds), _LEAST_SD).tolist()
-            noises = [replace(self.design.noise, fast_sd=fast, slow_sd=slow) for fast, slow in sds]
+            sds = np.maximum([(each.sd_fast, each.sd_slow) for each in drawn], _LEAST_SD).tolist()
+            noises = [replace(exact, fast_sd=fast, slow_sd=slow) for fast, slow in sds]
             designs = [replace(self.design, noise=noise) for noise in noises]
         solved = solve_each(designs, config.control_interval, pullers_of(config, seeds), config.meniscus)
-        return replace(self, gains_by_slot=solved)
+        told = (np.array([each.told_power for each in drawn]), np.array([each.told_temperature for each in drawn]))
+        return replace(self, gains_by_slot=solved, told=told)
+
+    def step(self, seen: Measured, memory: LQGMemory) -> tuple[Floats, Floats, LQGMemory]:
+        """Pull speed and heater power above what is told as nominal, and the new memory."""
+        power, warmer = self.told
+        own = seen._replace(Q_H=seen.Q_H + power, T_1=seen.T_1 + warmer, **{
+            name: getattr(seen, name) + warmer for name in ("T_1_ref", "T_1_ref_1min", "T_1_ref_5min")
+        })  # fmt: skip
+        pull, heat, memory = super().step(own, memory)
+        return pull, heat - power, memory
 
 
 class ExactState(NamedTuple):
@@ -374,8 +391,9 @@ class FullInformation(PrivilegedLQG):
         array, single = batched(observation)
         values = (array * scales(STATE, self.v_0, self.heater_range)).T
         seen: Any = SimpleNamespace(**dict(zip((channel.name for channel in STATE), values, strict=True)))
-        pull, power, memory = self.step(seen, reset_rows(state, self.at_rest(seen), episode_start))
-        return tag(to_action(pull / self.v_0, power / self.heater_range, single), self.made_for), memory
+        pull, power, memory = LQG.step(self, seen, reset_rows(state, self.at_rest(seen), episode_start))
+        heat = (power - self.told[0]) / self.heater_range
+        return tag(to_action(pull / self.v_0, heat, single), self.made_for), memory
 
 
 @lru_cache(maxsize=16)

@@ -4,7 +4,7 @@ The update takes one scalar measurement at a time, for a batch of slots, each wi
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from scipy.signal import cont2discrete
 
 from cz_gym.body.process import INPUTS, OUTPUTS, linearise
-from cz_gym.episodes.scenario import Sensor
+from cz_gym.episodes.scenario import Scenario, Sensor
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.plant import Puller, hidden_load
 from cz_gym.support.units import MINUTE, MM
@@ -78,6 +78,7 @@ STATES = ("r_c", "h_c", "T_1", "T_2", "T_b", "fast", "slow", "drift", "drift_rat
 PLANT = 5
 """Number of the plant's own states, which come first."""
 FAST, SLOW, DRIFT, DRIFT_RATE, HEATER = range(PLANT, len(STATES))
+_T_1, _T_2 = STATES.index("T_1"), STATES.index("T_2")
 _STEP = 1e-30
 
 
@@ -113,11 +114,21 @@ class NoiseModel:
     """Standard deviation of the pyrometer's noise [K]."""
     start_radius_sd: float = 0.2 * MM
     """Standard deviation of the initial radius [m]."""
+    told_power_sd: float = 0.0
+    """Standard deviation of the nominal power that it is told, and of the power's reading [W]."""
+    told_temperature_sd: float = 0.0
+    """Standard deviation of the nominal temperature that it is told [K]."""
 
     def __post_init__(self) -> None:
         taus = ("fast_tau", "slow_tau", "drift_rate_tau", "camera_memory")
-        walks = ("heater_walk", "thermal_walk", "start_radius_sd")
+        walks = ("heater_walk", "thermal_walk", "start_radius_sd", "told_power_sd", "told_temperature_sd")
         check_numbers(self, (*taus, "camera_sd", "pyrometer_sd"), ("fast_sd", "slow_sd", "drift_rate_sd", *walks))
+
+
+def expect_errors(noise: NoiseModel, scenario: Scenario, power: float) -> NoiseModel:
+    """The noise model with the errors of told values and readings that a scenario has, at this nominal power [W]."""
+    read = math.hypot(scenario.told.power_sd, scenario.readings.scale_sd * power)
+    return replace(noise, told_power_sd=read, told_temperature_sd=scenario.told.temperature_sd)
 
 
 class PlantModel(NamedTuple):
@@ -151,8 +162,22 @@ def plant_model(puller: Puller, noise: NoiseModel, dt: float, meniscus: Meniscus
     start = np.zeros(len(STATES))
     start[0] = noise.start_radius_sd
     start[[FAST, SLOW, DRIFT_RATE]] = noise.fast_sd, noise.slow_sd, noise.drift_rate_sd
+    start[HEATER] = noise.told_power_sd
     A, B, *_ = cont2discrete((F, G, H, np.zeros((2, 2))), dt, method="zoh")
-    return PlantModel(A, B, H, sampled_noise(F, np.diag(W), dt), np.diag(start**2))
+    warmer = noise.told_temperature_sd * _warmer(F, G)
+    return PlantModel(A, B, H, sampled_noise(F, np.diag(W), dt), np.diag(start**2) + np.outer(warmer, warmer))
+
+
+def _warmer(F: Floats, G: Floats) -> Floats:
+    """The state of a crystal in balance whose heater is a kelvin warmer than what is told: the drift's, at any power.
+
+    The melt is nominal. Heater and crucible stand still under the drift; a heater state makes up for the power.
+    """
+    x = np.zeros(len(STATES))
+    x[_T_1] = x[DRIFT] = 1.0
+    x[_T_2] = -F[_T_2, _T_1] / F[_T_2, _T_2]
+    x[HEATER] = -(F[_T_1] @ x) / G[_T_1, 1]
+    return x
 
 
 def sampled_noise(F: Floats, W: Floats, dt: float) -> Floats:
@@ -242,11 +267,20 @@ MEAN_RIPPLE = 0.4
 """Standard deviation of a ripple whose amplitude is uniform from zero to A, in units of A: 1/sqrt(6), rounded."""
 
 
+LEAST_RIPPLE = 1e-6
+"""A ripple below it is none [m]: whole revolutions average it out."""
+
+
+def ripple_left(sensor: Sensor) -> float:
+    """Standard deviation of the ripple that a scenario's averaging leaves in the ring's readings [m]."""
+    left = MEAN_RIPPLE * sensor.ripple[1] * abs(float(np.sinc(sensor.averaging)))
+    return left if left > LEAST_RIPPLE else 0.0
+
+
 def ring_of(sensor: Sensor) -> RingModel | None:
     """The model of a scenario's camera; None for one without latency and ripple."""
-    if sensor.latency == 0.0 and not any(sensor.ripple):
-        return None
-    return RingModel(sensor.latency, MEAN_RIPPLE * sensor.ripple[1], rotation=sensor.rotation)
+    ripple = ripple_left(sensor)
+    return RingModel(sensor.latency, ripple, rotation=sensor.rotation) if sensor.latency or ripple else None
 
 
 def augmented(model: PlantModel, ring: RingModel, dt: float) -> PlantModel:

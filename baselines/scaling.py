@@ -25,7 +25,7 @@ from cz_gym.support.units import MM
 from .analysis import CUT_OFF, design_compensator
 from .crystal import CrystalPID
 from .lqg import LQGDesign
-from .lqg_filter import MEAN_RIPPLE, ring_of
+from .lqg_filter import expect_errors, ring_of, ripple_left
 from .tuned import with_values
 
 JUMP = 1.0 * MM
@@ -55,7 +55,7 @@ def factors(config: Config) -> dict[str, float]:
     """
     default, own = radius_model(make_puller()), model_of(config)
     time, pullers = default.zero / own.zero, [make_puller(each) for each in (parameters_of(config), DEFAULT.parameters)]
-    trims = [p.v_0 * p.rho_dH * p.h_0 / p.k_l for p in pullers]
+    trims = [p.v_0 * p.rho_dH * (p.h_0 + p.layer) / p.k_l for p in pullers]
     gains = [design_compensator(model, CUT_OFF / slower).gain for model, slower in ((own, time), (default, 1.0))]
     return {
         "time": time,
@@ -109,11 +109,12 @@ def scale_lqg(design: LQGDesign, config: Config) -> LQGDesign:
         fast_tau=melt.tau_fast,
         slow_tau=melt.tau_slow,
         pyrometer_sd=_rms(sensor.pyrometer_noise) / _rms(RANDOMIZED.sensor.pyrometer_noise) * known.pyrometer_sd,
-        camera_sd=max(float(np.hypot(np.mean(sensor.camera_noise), MEAN_RIPPLE * sensor.ripple[1])), least),
+        camera_sd=max(float(np.hypot(np.mean(sensor.camera_noise), ripple_left(sensor))), least),
         camera_sd_range=(max(sensor.camera_noise[0], least), most),
         heater_walk=known.heater_walk * config.heater_range / DEFAULT.power_range,
         start_radius_sd=max(scenario.pullers.start_radius_sd, known.start_radius_sd),
     )
+    noise = expect_errors(noise, scenario, make_puller(parameters_of(config)).Q_H_0)
     slack = HEATER_SLACK * drives.heater_step
     design = replace(design, noise=noise, ring=ring_of(sensor), heater_slack=slack, error_pull=None)
     if not (math.isfinite(drives.pull_window) or math.isfinite(drives.pull_slew)):
@@ -140,7 +141,7 @@ def scale_crystal(settings: Any, config: Config) -> Any:
         return scale_pid(settings, config)
     own, given, dt = config.ranges, settings.weights, config.control_interval
     here, default = make_puller(parameters_of(config)), make_puller()
-    grows = [each.k_l / (each.rho_dH * each.h_0) for each in (here, default)]
+    grows = [each.k_l / (each.rho_dH * (each.h_0 + each.layer)) for each in (here, default)]
     noise = settings.noise._replace(height=grows[0] / grows[1] * settings.noise.height)
     pull, power = own[0] / PULL_SCALE, own[1] / HEATER_SCALE
     drives = [each.actuators for each in config.scenario.scenarios]

@@ -21,12 +21,13 @@ from cz_gym.episodes.scenarios import HARD, PULLER, RANDOMIZED, SENSOR_FAULT, fi
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import Contender
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.physics.plant import make_puller
 from cz_gym.process import Process
 from cz_gym.puller.file import DEFAULT, FOLDER, PullerFile
 from cz_gym.support.errors import CzError
 
 from .lqg import STEP_TIME, LQGDesign
-from .lqg_filter import ring_of
+from .lqg_filter import expect_errors, ring_of
 from .margins import MarginLimits
 
 TUNED = (RANDOMIZED, HARD, SENSOR_FAULT, PULLER)
@@ -291,10 +292,12 @@ class TunedController:
         return process
 
     def settings(self, scenario: Scenario) -> Any:
-        """Tuned settings for a scenario on the default puller; a design has the model of the scenario's camera."""
+        """Tuned settings for a scenario on the default puller; a design has the model of the scenario's instruments."""
         start = self.start
         if isinstance(start, LQGDesign):
-            start = replace(start, ring=ring_of((PULLER if self.one_for_all else scenario).sensor))
+            met = PULLER if self.one_for_all else scenario
+            noise = expect_errors(start.noise, met, make_puller().Q_H_0)
+            start = replace(start, ring=ring_of(met.sensor), noise=noise)
         return with_values(start, for_scenario(self.name, RANDOMIZED if self.one_for_all else scenario))
 
     def make(self, config: Config) -> Any:

@@ -123,7 +123,7 @@ class Config:
         given, apart = self.parameters._asdict(), self.process.apart
         numbers = (0.0 if name in apart else float(value) + 0.0 for name, value in given.items())
         parameters = type(self.parameters)(*numbers)
-        return _hash(VERSION, *parameters, *_computed(self.process, self.meniscus, parameters))
+        return _hash(VERSION, *_without_layer(parameters), *_computed(self.process, self.meniscus, parameters))
 
     @property
     def reward_hash(self) -> str:
@@ -253,10 +253,15 @@ def _computed(process: Process, meniscus: MeniscusModel, parameters: Parameters)
     with np.errstate(all="ignore"):
         for lam in (0.0, 0.4, 1.0):
             p = process.derive(parameters, Factors(lam=lam), meniscus)
-            numbers += [*p, process.hidden_load(3.0, p)]
+            numbers += [*_without_layer(p), process.hidden_load(3.0, p)]
             for x, u, d in process.check_points(p):
                 numbers += [*process.rates(x, u, d, p, meniscus), *process.perfect_readings(x, p, meniscus)]
     return tuple(numbers)
+
+
+def _without_layer(numbers: Any) -> list[float]:
+    """The numbers of a puller; those of the boundary layer, younger than published hashes, only where there is one."""
+    return [value for name, value in numbers._asdict().items() if name not in ("R", "layer") or value]
 
 
 def positive_whole(name: str, value: int) -> int:

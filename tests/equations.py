@@ -25,7 +25,9 @@ def design_rates(x: np.ndarray, u: Truth, p: Any) -> np.ndarray:
     A, B = h_c / (2 * r_c), 1 - h_c**2 / p.a**2
     theta = np.arcsin(B / np.sqrt(1 + A**2)) - np.arctan(A)
     alpha_c = theta - np.arctan2(p.sin_alpha_0, p.cos_alpha_0)
-    Phi_l = p.k_l * (T_b + u.dT_i - p.T_m) * (p.lam / h_c + (1 - p.lam) / p.h_0)
+    R = p.layer / p.k_l
+    through = p.lam / (h_c / p.k_l + R) + (1 - p.lam) / (p.h_0 / p.k_l + R)
+    Phi_l = (T_b + u.dT_i - p.T_m) * through
     v_g = (p.Phi_s - Phi_l) / p.rho_dH
     link = p.kappa_12 * (T_1**4 - T_2**4)
     wall = p.G_2b * (T_2 - T_b)

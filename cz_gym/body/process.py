@@ -64,8 +64,8 @@ def begin(slot: Any, m: Any) -> Any:
 
 @jittable
 def nominal(x: Any, slot: Any, interval: Any) -> Any:
-    """The operating point's inputs."""
-    return Inputs(slot.puller.v_0, slot.puller.Q_H_0)
+    """The operating point's inputs, as controllers are told."""
+    return Inputs(slot.puller.v_0, slot.puller.Q_H_0 + slot.episode.told_power)
 
 
 @jittable

@@ -144,7 +144,7 @@ TEMPERATURE_SCALE = 5.0
 class Measured(NamedTuple):
     """Readings and recipe in a puller's control computer, in SI units; arrays of the batch's shape where decoded.
 
-    Temperatures, power and pull speed are deviations from the puller's own nominal; radii from r_0.
+    Temperatures, power and pull speed are deviations from the nominal that controllers are told; radii from r_0.
     """
 
     ring_error: Annotated[
@@ -177,9 +177,9 @@ def measure(x: Any, u: Any, nominal: Any, memory: Any, readings: Any, slot: Any,
         T_1_ref=recipe(t, e),
         T_1_ref_1min=recipe(t + _IN_1_MIN, e),
         T_1_ref_5min=recipe(t + _IN_5_MIN, e),
-        T_1=readings.T_1 - p.T_1_0,
+        T_1=readings.T_1 - (p.T_1_0 + e.told_temperature),
         v_p=read.v_p - p.v_0,
-        Q_H=read.Q_H - p.Q_H_0,
+        Q_H=read.Q_H - (p.Q_H_0 + e.told_power),
         v_p_mean=e.pull_scale * memory.v_p_mean + e.pull_offset - p.v_0,
     )
 
@@ -188,7 +188,10 @@ _SHARED = signals(Measured)
 
 
 class TrueState(NamedTuple):
-    """The true state and the disturbances; deviations, SI units. For bounds and for training; no agent acts on it."""
+    """The true state and the disturbances; deviations from the puller's own nominal, SI units.
+
+    For bounds and for training; no agent acts on it.
+    """
 
     r_c_error: Annotated[Any, Channel("m", MM, "true radius minus r_ref")]
     h_c: Annotated[Any, Channel("m", MM, "true meniscus height minus its nominal")]
@@ -198,7 +201,7 @@ class TrueState(NamedTuple):
     r_ref: Annotated[Any, _SHARED["r_ref"]]
     r_ref_1min: Annotated[Any, _SHARED["r_ref_1min"]]
     r_ref_5min: Annotated[Any, _SHARED["r_ref_5min"]]
-    T_1_ref: Annotated[Any, _SHARED["T_1_ref"]]
+    T_1_ref: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "recipe of the heater temperature minus its own nominal")]
     T_1_ref_1min: Annotated[Any, _SHARED["T_1_ref_1min"]]
     T_1_ref_5min: Annotated[Any, _SHARED["T_1_ref_5min"]]
     v_p: Annotated[Any, _SHARED["v_p"]]
@@ -213,7 +216,7 @@ class TrueState(NamedTuple):
 @jittable
 def true_state(slot: Any, measured: Any, t: Any) -> Any:
     """:class:`TrueState` of a slot at its sample's time t [s]."""
-    p, x = slot.puller, slot.x
+    p, x, warmer = slot.puller, slot.x, slot.episode.told_temperature
     return TrueState(
         r_c_error=x.r_c - p.r_0 - measured.r_ref,
         h_c=x.h_c - p.h_0,
@@ -223,9 +226,9 @@ def true_state(slot: Any, measured: Any, t: Any) -> Any:
         r_ref=measured.r_ref,
         r_ref_1min=measured.r_ref_1min,
         r_ref_5min=measured.r_ref_5min,
-        T_1_ref=measured.T_1_ref,
-        T_1_ref_1min=measured.T_1_ref_1min,
-        T_1_ref_5min=measured.T_1_ref_5min,
+        T_1_ref=measured.T_1_ref + warmer,
+        T_1_ref_1min=measured.T_1_ref_1min + warmer,
+        T_1_ref_5min=measured.T_1_ref_5min + warmer,
         v_p=slot.v_p - p.v_0,
         Q_H=slot.Q_H - p.Q_H_0,
         v_p_mean=slot.v_p_mean - p.v_0,
@@ -297,7 +300,7 @@ def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, m: Any) -> An
         Q_H=slot.Q_H,
         v_p_mean=slot.v_p_mean,
         T_1=x.T_1,
-        T_1_ref=p.T_1_0 + measured.T_1_ref,
+        T_1_ref=p.T_1_0 + slot.episode.told_temperature + measured.T_1_ref,
         T_b=x.T_b,
         r_br_measured=slot.ring + p.ring_bias,
         ring_offset=bias_offset(t, slot.episode),

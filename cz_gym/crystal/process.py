@@ -123,9 +123,8 @@ def nominal(x: Any, slot: Any, interval: Any) -> Any:
     """The recipe's inputs at the length of the interval's middle: held inputs would else lag behind it."""
     p = slot.puller
     row, share = recipe.place(x.L + 0.5 * interval * growth_rate(x.L, p), p)
-    return Inputs(
-        recipe.look_up(slot.table, row, share, recipe._v_p), recipe.look_up(slot.table, row, share, recipe._Q_H)
-    )
+    power = recipe.look_up(slot.table, row, share, recipe._Q_H) + slot.episode.told_power
+    return Inputs(recipe.look_up(slot.table, row, share, recipe._v_p), power)
 
 
 @jittable

@@ -223,7 +223,7 @@ def _balance(table: Any, row: Any, p: Any, e: Any, dL: Any, m: Any) -> None:
     M_men = meniscus_mass(at.r, h_c, cos_theta, p)
     Phi_s = crystal_flux(at.r, table[row, _A_s], depth(table[row, _M_s], M_men, p), p)
     Phi_l = Phi_s - p.rho_dH * at.v_g
-    T_b = p.T_m + Phi_l / (p.k_l * (p.lam / h_c + (1.0 - p.lam) / p.h_0))
+    T_b = p.T_m + Phi_l / (p.k_l * (p.lam / (h_c + p.layer) + (1.0 - p.lam) / (p.h_0 + p.layer)))
     area = math.pi * at.r * at.r
     surface = p.emission * (math.pi * p.R_cr * p.R_cr - area) * (fourth_power(T_b) - fourth_power(p.T_e))
     leaves = p.C_b / p.M_0 * (T_b - p.T_m) * p.rho_s * area * at.v_g

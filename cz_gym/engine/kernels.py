@@ -295,12 +295,13 @@ def _begin(slot: Any, interval: Any, model: Any) -> None:
     e, process = slot.episode, model.process
     set_labelled(process.State, process.begin(slot, model.meniscus), slot.x)
     nominal = process.nominal(slot.x, slot, interval)
-    slot.v_p, slot.Q_H, slot.Q_H_slewed = nominal.v_p, nominal.Q_H, nominal.Q_H
-    slot.v_p_before, slot.Q_H_before, slot.clipped = nominal.v_p, nominal.Q_H, 0.0
+    power = nominal.Q_H - e.told_power  # the crystal grows, whatever the controller is told
+    slot.v_p, slot.Q_H, slot.Q_H_slewed = nominal.v_p, power, power
+    slot.v_p_before, slot.Q_H_before, slot.clipped = nominal.v_p, power, 0.0
     slot.v_p_nominal, slot.Q_H_nominal = nominal.v_p, nominal.Q_H
     slot.fast, slot.slow = first_fluctuation(e, slot.streams)
     slot.dT_i, slot.Q_d, slot.drift = fluctuation(e, slot.fast, slot.slow), 0.0, np.nan
-    slot.integral, slot.Q_heats = 0.0, nominal.Q_H
+    slot.integral, slot.Q_heats = 0.0, power
     slot.v_p_misread = slot.Q_H_misread = 0.0
     slot.k = slot.frames = slot.over = slot.point = 0
 

@@ -47,6 +47,8 @@ class Stream(IntEnum):
     FAULTS = 5
     DROPOUTS = 6
     OUTLIERS = 7
+    LAYER = 8
+    TOLD = 9
 
 
 def stream_number(index: int) -> int:
@@ -86,7 +88,7 @@ class Episode(NamedTuple):
     ripple_amplitude: float = 0.0
     ripple_omega: float = 0.0
     ripple_phase: float = 0.0
-    """Ripple of the ring: amplitude [m], angular frequency [rad/s], phase at t = 0 [rad]."""
+    """Ripple of the ring's readings: amplitude [m], angular frequency [rad/s], phase at t = 0 [rad]."""
     pyrometer_drift: float = 0.0
     latency: float = 0.0
     pull_window: float = math.inf
@@ -119,10 +121,13 @@ class Episode(NamedTuple):
     heater_offset: float = 0.0
     heater_resolution: float = 0.0
     delay: float = 0.0
+    told_power: float = 0.0
+    told_temperature: float = 0.0
+    """Nominal power [W] and temperature [K] that controllers are told, minus the puller's own."""
 
 
 class Factors(NamedTuple):
-    """A puller's factors on its design parameters, and its mix of models."""
+    """A puller's factors on its design parameters, its mix of models, and what they lack."""
 
     lam: float = 1.0
     a: float = 1.0
@@ -134,6 +139,10 @@ class Factors(NamedTuple):
     C_1: float = 1.0
     C_2: float = 1.0
     C_b: float = 1.0
+    R: float = 0.0
+    """Resistance of the boundary layer beside the design's [m2 K/W]."""
+    phi_b: float = 0.0
+    """Slope of the meniscus at the ring [rad]; 0: the design's."""
 
 
 RECORD = np.dtype(
@@ -178,6 +187,10 @@ SHORTEST = 1e-9
 """Least duration of a ramp [s]; one of zero duration is a jump."""
 _START, _PARAMETERS, _SCHEDULE = int(Stream.START), int(Stream.PARAMETERS), int(Stream.SCHEDULE)
 _INTERFACE, _SENSOR, _FAULTS = int(Stream.INTERFACE), int(Stream.SENSOR), int(Stream.FAULTS)
+_LAYER, _TOLD = int(Stream.LAYER), int(Stream.TOLD)
+AVERAGING_ERROR = 0.02
+"""Standard deviation of the relative error of the time over which the ring is averaged: the rotation is known so well
+[-]."""
 _SPREAD_NUMBERS, _HOT_ZONE_NUMBERS, _FAULT_NUMBERS = 7, 7, 5 + 3 * FREEZES
 
 
@@ -251,18 +264,22 @@ def draw_factors(record: Any, mix: Any, streams: Any) -> Any:
         C_1=_log_factor(capacity, v[0]),
         C_2=_log_factor(capacity, v[1]),
         C_b=_log_factor(melt, v[2]),
+        R=between(spread.boundary_layer, uniform(streams[_LAYER])),
+        phi_b=spread.ring_slope,
     )
 
 
 @jittable
 def randomised(q: Any, f: Any) -> Any:
-    """The parameters of the drawn puller: factors on a, k_l, the conductances and the heat capacities."""
+    """The parameters of the drawn puller: factors on a, k_l, the conductances and the heat capacities; layer, ring."""
+    phi_b = f.phi_b if f.phi_b > 0.0 else q.phi_b
     return Parameters(
         sigma=q.sigma * f.a**2, rho_l=q.rho_l, alpha_0=q.alpha_0, g=q.g, sigma_SB=q.sigma_SB, k_l=q.k_l * f.k_l,
-        rho_s=q.rho_s, dH=q.dH, T_m=q.T_m, dT_0=q.dT_0, phi_b=q.phi_b, r_0=q.r_0, v_0=q.v_0,
+        rho_s=q.rho_s, dH=q.dH, T_m=q.T_m, dT_0=q.dT_0, r_0=q.r_0, v_0=q.v_0,
+        phi_b=phi_b,
         C_1=q.C_1 * f.C_1, C_2=q.C_2 * f.C_2, C_b=q.C_b * f.C_b,
         kappa_12=q.kappa_12 * f.kappa_12, G_1a=q.G_1a * f.G_1a, T_a=q.T_a,
-        G_2b=q.G_2b * f.G_2b, eps=q.eps * f.kappa_b, R_cr=q.R_cr, T_e=q.T_e,
+        G_2b=q.G_2b * f.G_2b, eps=q.eps * f.kappa_b, R_cr=q.R_cr, T_e=q.T_e, R=q.R + f.R,
     )  # fmt: skip
 
 
@@ -281,6 +298,10 @@ def draw_episode(record: Any, streams: Any, freezes: Any) -> Any:
     readings, reads = record.readings, _draw_readings(record.readings, streams[_FAULTS])
     r_c_start = record.pullers.start_radius_sd * normal(streams[_START])
     slow = _uniforms(streams[_START], 3)
+    told_power, told_temperature = two_normals(streams[_TOLD])
+    ripple_omega = 2.0 * math.pi * between(sensor.rotation, read[5])
+    revolutions = sensor.averaging * (1.0 + AVERAGING_ERROR * normal(streams[_TOLD])) if ripple_omega > 0.0 else 0.0
+    amplitude, phase = _averaged(between(sensor.ripple, read[4]), 2.0 * math.pi * read[6], revolutions)
     return Episode(
         r_c_start=r_c_start, melt_loss=record.pullers.melt_loss,
         recipe_start=between(recipe.start, plan[2]), recipe_duration=max(recipe_duration, SHORTEST),
@@ -292,8 +313,7 @@ def draw_episode(record: Any, streams: Any, freezes: Any) -> Any:
         reference_amount=between(reference.amount, plan[7]) * moved,
         ring_offset=between(sensor.bias_offset, read[2]) + between(sensor.level_offset, read[3]),
         bias_drift_start=fault[0], bias_drift_duration=fault[1], bias_drift_amount=fault[2], dropout=fault[3],
-        ripple_amplitude=between(sensor.ripple, read[4]),
-        ripple_omega=2.0 * math.pi * between(sensor.rotation, read[5]), ripple_phase=2.0 * math.pi * read[6],
+        ripple_amplitude=amplitude, ripple_omega=ripple_omega, ripple_phase=phase,
         camera_sd=between(sensor.camera_noise, read[0]), pyrometer_sd=between(sensor.pyrometer_noise, read[1]),
         pyrometer_drift=between(sensor.pyrometer_drift, read[7]),
         pyrometer_filter=between(sensor.pyrometer_filter, slow[2]),
@@ -306,7 +326,18 @@ def draw_episode(record: Any, streams: Any, freezes: Any) -> Any:
         pull_scale=reads[0], pull_offset=reads[1], pull_resolution=readings.pull_resolution,
         heater_scale=reads[2], heater_offset=reads[3], heater_resolution=readings.heater_resolution,
         delay=readings.delay,
+        told_power=record.told.power_sd * told_power, told_temperature=record.told.temperature_sd * told_temperature,
     )  # fmt: skip
+
+
+@jittable
+def _averaged(amplitude: Any, phase: Any, revolutions: Any) -> Any:
+    """Amplitude and phase of a ripple in its mean over the revolutions before each frame; exact."""
+    half = math.pi * revolutions
+    if not half > 0.0:
+        return amplitude, phase
+    share = np.sin(half) / half
+    return amplitude * np.abs(share), phase - half + (math.pi if share < 0.0 else 0.0)
 
 
 @jittable

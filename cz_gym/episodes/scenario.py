@@ -106,6 +106,13 @@ class Pullers:
         "log-uniform factor on kappa_12, G_1a, G_2b and kappa_b, each on its own, beside their uniform one",
         later=True,
     )
+    boundary_layer: Range = member(
+        NONE, Variation.RANGE, ("m2K/W", 0.0, 0.1), "resistance under the crystal, beside the puller's own", later=True
+    )
+    ring_slope: float = member(
+        0.0, Variation.NEVER, ("deg", 0.0, 60.0), "slope of the meniscus at the ring, in place of phi_b; 0: phi_b",
+        later=True,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -157,6 +164,7 @@ class Sensor:
     level_offset: Range = machine("level_offset", NONE, Variation.RANGE)
     ripple: Range = machine("ripple", NONE, Variation.NONZERO)
     rotation: Range = machine("rotation", NONE, Variation.RANGE)
+    averaging: float = machine("averaging", 0.0, Variation.NEVER)
     latency: float = machine("latency", 0.0, Variation.NEVER)
     outlier_probability: float = machine("outlier_probability", 0.0, Variation.NONZERO)
     outlier_sd: float = machine("outlier_sd", 0.0, Variation.NEVER)
@@ -218,6 +226,18 @@ class DriveReadings:
 
 
 @dataclass(frozen=True)
+class Told:
+    """Errors of the nominal values that controllers are told: actions, observations and the recipe count from them."""
+
+    power_sd: float = member(
+        0.0, Variation.NONZERO, ("kW", 0.0, 50.0), "standard deviation of the nominal power's error", later=True
+    )
+    temperature_sd: float = member(
+        0.0, Variation.NONZERO, ("K", 0.0, 100.0), "standard deviation of the nominal temperature's error", later=True
+    )
+
+
+@dataclass(frozen=True)
 class Scenario:
     """A distribution of episodes, by family; frozen, comparable, hashed."""
 
@@ -231,6 +251,7 @@ class Scenario:
     faults: Faults = field(default_factory=Faults)
     actuators: Actuators = field(default_factory=Actuators)
     readings: DriveReadings = field(default_factory=DriveReadings)
+    told: Told = field(default_factory=Told)
     series: tuple[tuple[float, float], ...] = ()
     """Heat load on the melt [W] and fluctuation of the interface [K] on the 5 s grid, in place of drawn ones; the last
     values stay (:mod:`cz_gym.episodes.scenario`)."""

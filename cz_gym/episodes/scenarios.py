@@ -19,6 +19,7 @@ from .scenario import (
     AnyScenario,
     Distribution,
     Drift,
+    DriveReadings,
     Faults,
     Interface,
     Mixture,
@@ -27,6 +28,7 @@ from .scenario import (
     Scenario,
     Sensor,
     TemperatureRamp,
+    Told,
     make_mixture,
     read_series,
 )
@@ -90,6 +92,8 @@ SENSOR_FAULT = replace(
     ),
 )
 
+_ROUGHLY_TOLD = Told(power_sd=1.0 * KILO, temperature_sd=2.0)
+
 PULLER = replace(
     RANDOMIZED,
     name="puller",
@@ -102,6 +106,7 @@ PULLER = replace(
         level_offset=_either_way(0.1 * MM),
         ripple=(0.0, 0.2 * MM),
         rotation=(8.0 / MINUTE, 15.0 / MINUTE),
+        averaging=1.0,
         latency=5.0,
         outlier_probability=0.005,
         outlier_sd=1.0 * MM,
@@ -112,7 +117,10 @@ PULLER = replace(
         heater_slew=2.0 * KILO / MINUTE,
         heater_step=0.1 * KILO,
     ),
+    readings=DriveReadings(scale_sd=0.01),
+    told=_ROUGHLY_TOLD,
 )
+PULLER_FRAMES = replace(PULLER, name="puller-frames", sensor=replace(PULLER.sensor, averaging=0.0))
 
 HOT_ZONE = replace(
     RANDOMIZED,
@@ -123,9 +131,18 @@ HOT_ZONE = replace(
         capacity_factor=(0.5, 2.0),
         melt_capacity_factor=(0.7, 1.4),
         conductance_factor=(0.75, 1.33),
+        boundary_layer=(0.0, 8e-4),
     ),
     sensor=replace(RANDOMIZED.sensor, pyrometer_filter=(0.0, 20.0)),
     actuators=replace(RANDOMIZED.actuators, heater_lag=(0.0, 10.0)),
+    told=_ROUGHLY_TOLD,
+)
+
+MELT_LAYER = replace(RANDOMIZED, name="melt-layer", pullers=replace(RANDOMIZED.pullers, boundary_layer=(7e-4, 7e-4)))
+TRACED_SLOPE = math.radians(39.3)
+"""Slope of the meniscus at the edge of the bright area that rays through the exact meniscus show [rad]."""
+RANDOMIZED_TRACED = replace(
+    RANDOMIZED, name="randomized-traced", pullers=replace(RANDOMIZED.pullers, ring_slope=TRACED_SLOPE)
 )
 
 _ONE_FAMILY = (
@@ -138,6 +155,7 @@ SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
     for scenario in (
         NOMINAL, PAPER_RAMP, REFERENCE_A, REFERENCE_B, RANDOMIZED, HARD, SENSOR_FAULT, PULLER, HOT_ZONE, *_ONE_FAMILY,
+        PULLER_FRAMES, MELT_LAYER, RANDOMIZED_TRACED,
     )
 }  # fmt: skip
 """Every named scenario."""

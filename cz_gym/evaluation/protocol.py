@@ -213,7 +213,7 @@ CASES: tuple[Case, ...] = (
     ),
     Case("hard", "hard", "the same families, half as wide again or more"),
     Case("sensor-fault", "sensor-fault", "randomized with frozen frames, drop-outs and a drifting ring"),
-    Case("puller", "puller", "randomized with latency, ripple, outliers, a wrong ring bias and slow, narrow drives"),
+    Case("puller", "puller", "randomized with latency, outliers, wrong bias, erring readings and slow, narrow drives"),
     Case("hot-zone", "hot-zone", "randomized on hot zones that differ from the design values by up to a factor of two"),
     Case("paper-ramp-I", "paper-ramp", _RAMP, "I"),
     Case("paper-ramp-II", "paper-ramp", _RAMP, "II"),
@@ -233,6 +233,9 @@ CASES: tuple[Case, ...] = (
     ),
     Case("randomized-I", "randomized", "randomized, every puller conducting only: Model I", "I", default=False),
     Case("randomized-II", "randomized", "randomized, every puller convecting only: Model II", "II", default=False),
+    Case("puller-frames", "puller-frames", "puller with a ring read from single, aliased frames", default=False),
+    Case("melt-layer", "melt-layer", "randomized over a boundary layer that no controller knows of", default=False),
+    Case("randomized-traced", "randomized-traced", "randomized, its ring the edge that rays show", default=False),
     Case("randomized-2s", "randomized", "randomized, an action every 2 s", default=False, interval=2.0),
     Case("randomized-10s", "randomized", "randomized, an action every 10 s", default=False, interval=10.0),
     Case(

@@ -20,7 +20,7 @@ SIZES: dict[str, dict[str, float]] = {
     "K": {"°C": 1.0}, "K/s": {"K/min": 1.0 / MINUTE, "K/h": 1.0 / HOUR}, "s": {"ms": 1e-3, "min": MINUTE},
     "rev/s": {"rpm": 1.0 / MINUTE}, "W": {"kW": KILO, "MW": 1e6}, "W/s": {"kW/min": KILO / MINUTE},
     "N/m": {"mN/m": 1e-3}, "kg": {"g": 1e-3}, "kg/m3": {"g/cm3": KILO}, "J/kg": {"kJ/kg": KILO}, "J/K": {"kJ/K": KILO},
-    "W/K": {"kW/K": KILO}, "W/m/K": {"W/cm/K": 100.0}, "W/K4": {}, "W/m2/K4": {},
+    "W/K": {"kW/K": KILO}, "W/m/K": {"W/cm/K": 100.0}, "W/K4": {}, "W/m2/K4": {}, "m2K/W": {"cm2K/W": 1e-4}, "rev": {},
 }  # fmt: skip
 """SI units, each with the units that users may state or mean instead, and their sizes in it."""
 _SI = {name: si for si, sizes in SIZES.items() for name in (si, *sizes)}
@@ -118,7 +118,10 @@ _TABLES: dict[str, dict[str, Quantity]] = {
         "T_m": Q("K", "melting temperature", _L, 200.0, 3e3),
     },
     "hot_zone": {
-        "dT_0": Q("K", "nominal superheat of the melt bulk", f"fitted: stable pole of {_II}", 0.01, 500.0),
+        "dT_0": Q("K", "nominal superheat of the melt at the meniscus", f"fitted: stable pole of {_II}", 0.01, 500.0),
+        "R": Q("m2K/W", "thermal resistance of the boundary layer between melt bulk and meniscus",
+               "none in Part II; 6e-4 to 8e-4 in a public computation of the flow", 0.0, 0.1, "boundary_layer",
+               (0.0, 2e-3), later=True),
         "C_1": Q("J/K", "heat capacity of the heater", f"{_E}: 30 kg graphite", 500.0, 1e8),
         "C_2": Q("J/K", "heat capacity of susceptor and crucible", f"{_E}: susceptor and quartz", 500.0, 1e8),
         "C_b": Q("J/K", "heat capacity of the melt bulk", f"{_E}: 80 kg melt", 500.0, 1e8),
@@ -156,6 +159,8 @@ _TABLES: dict[str, dict[str, Quantity]] = {
         "level_offset": Q("mm", "constant offset of the ring from the melt level", "", -5.0, 5.0, drawn=True),
         "ripple": Q("mm", "amplitude of the rotation-synchronous ripple", "", 0.0, 5.0, drawn=True),
         "rotation": Q("rpm", "crystal rotation", "", 0.0, 100.0, drawn=True),
+        "averaging": Q("rev", "revolutions of the crystal that a ring reading is the mean of; 0: a single frame", "",
+                       0.0, 20.0, later=True),
         "latency": Q("s", "age of the newest camera frame; frames are taken at samples and on the 5 s grid", "",
                      0.0, MAX_LATENCY),
         "outlier_probability": Q("%", "share of samples that carry an outlier", "", 0.0, 100.0),
@@ -232,6 +237,7 @@ class Parameters(NamedTuple):
     eps: float = 0.2
     R_cr: float = 0.28
     T_e: float = 1300.0
+    R: float = 0.0
 
 
 class CrystalRecipe(NamedTuple):

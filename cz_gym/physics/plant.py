@@ -88,6 +88,8 @@ class Puller(NamedTuple):
     """X(z_b) / M of the bright ring's slope [-]."""
     k_l: float
     """Thermal conductivity of the melt [W/m/K]."""
+    layer: float
+    """Depth of still melt that has the boundary layer's resistance, k_l R [m]."""
     rho_dH: float
     """Latent heat per volume of crystal, rho_s dH [J/m3]."""
     T_m: float
@@ -125,7 +127,7 @@ class Puller(NamedTuple):
     T_2_0: float
     """Nominal susceptor temperature [K]."""
     T_b_0: float
-    """Nominal melt temperature, T_m + dT_0 [K]."""
+    """Nominal melt temperature, T_m + dT_0 + Phi_l,0 R [K]."""
     Q_H_0: float
     """Nominal heater power [W]."""
     ring_bias: float
@@ -156,14 +158,17 @@ class _RingPuller(NamedTuple):
 
 @jittable
 def derive_puller(q: Any, lam: Any, height: Any, ring_offset: Any) -> Any:
-    """Solve the operating point in order: h_0, Phi_l0, Phi_s, Q_i0, T_2, T_1, Q_H0, ring bias."""
+    """Solve the operating point in order: h_0, Phi_l0, Phi_s, Q_i0, T_2, T_1, Q_H0, ring bias.
+
+    A boundary layer under the crystal changes no heat flux there; the melt below it is hotter.
+    """
     a = np.sqrt(2.0 * q.sigma / (q.rho_l * q.g))
     h_0 = height(q.r_0, q.alpha_0, a)
     Phi_l_0 = q.k_l * q.dT_0 / h_0
     rho_dH = q.rho_s * q.dH
     Phi_s = Phi_l_0 + rho_dH * q.v_0
     emission = q.eps * q.sigma_SB
-    T_b_0 = q.T_m + q.dT_0
+    T_b_0 = q.T_m + q.dT_0 + Phi_l_0 * q.R
     covered = math.pi * q.r_0 * q.r_0
     surface_loss = emission * (math.pi * q.R_cr * q.R_cr - covered) * (T_b_0**4 - q.T_e**4)
     through = surface_loss + covered * Phi_l_0
@@ -174,7 +179,7 @@ def derive_puller(q: Any, lam: Any, height: Any, ring_offset: Any) -> Any:
     bias = ring_offset(q.r_0, h_0, ring)
     return Puller(
         lam=lam, a=a, sin_alpha_0=ring.sin_alpha_0, cos_alpha_0=ring.cos_alpha_0, X_b=ring.X_b,
-        k_l=q.k_l, rho_dH=rho_dH, T_m=q.T_m, C_1=q.C_1, C_2=q.C_2, C_b=q.C_b,
+        k_l=q.k_l, layer=q.k_l * q.R, rho_dH=rho_dH, T_m=q.T_m, C_1=q.C_1, C_2=q.C_2, C_b=q.C_b,
         kappa_12=q.kappa_12, G_1a=q.G_1a, T_a=q.T_a, G_2b=q.G_2b, emission=emission, R_cr=q.R_cr, T_e=q.T_e,
         r_0=q.r_0, v_0=q.v_0, h_0=h_0, Phi_s=Phi_s,
         T_1_0=T_1_0, T_2_0=T_2_0, T_b_0=T_b_0, Q_H_0=Q_H_0, ring_bias=bias,
@@ -214,7 +219,7 @@ def growth(x: Any, d: Any, p: Any, slope: Any) -> Any:
 @force_inlined
 def interface(x: Any, d: Any, p: Any, Phi_s: Any, sin_theta: Any, cos_theta: Any) -> Any:
     """Growth with this heat flux into the crystal [W/m2], at this angle of the meniscus."""
-    Phi_l = p.k_l * (x.T_b + d.dT_i - p.T_m) * (p.lam / x.h_c + (1.0 - p.lam) / p.h_0)
+    Phi_l = p.k_l * (x.T_b + d.dT_i - p.T_m) * (p.lam / (x.h_c + p.layer) + (1.0 - p.lam) / (p.h_0 + p.layer))
     v_g = (Phi_s - Phi_l) / p.rho_dH
     sin_alpha = sin_theta * p.cos_alpha_0 - cos_theta * p.sin_alpha_0
     cos_alpha = cos_theta * p.cos_alpha_0 + sin_theta * p.sin_alpha_0

@@ -151,6 +151,7 @@ class PullerFile:
     level_offset: Range | None = None
     ripple: Range | None = None
     rotation: Range | None = None
+    averaging: float | None = None
     latency: float | None = None
     outlier_probability: float | None = None
     outlier_sd: float | None = None
@@ -198,7 +199,7 @@ class PullerFile:
                 continue
             if not quantity.later:
                 plain.append(value)
-            elif value is not None:
+            elif value not in (None, value_of(DEFAULT, quantity)):
                 later[quantity.symbol] = value
         contents = [FORMAT, plain, *([later] if later else [])]
         return hashlib.sha256(json.dumps(contents).encode()).hexdigest()[:16]
@@ -293,7 +294,7 @@ def chosen_puller(given: str | None) -> PullerFile:
 def defaults_of(puller: PullerFile) -> dict[str, Any]:
     """Values of the default puller for keys that the puller's file lacks, by key [SI units]."""
     values = {each.key: value_of(DEFAULT, each) for each in MACHINE.values() if each.key in puller.missing}
-    return {key: value for key, value in values.items() if value is not None}
+    return {key: value for key, value in values.items() if value}  # neither the scenario's own, nor nothing
 
 
 def doubts(puller: PullerFile) -> list[str]:

@@ -21,6 +21,7 @@ UNLIKE = {
     "v_p_mean": r"\bar{v}_p",
     "lam": r"\lambda",
     "X_b": r"\xi_b",
+    "layer": r"k_l R",
     "ring_bias": r"b",
     "melt": r"m",
     "ring_offset": r"\delta_{br}",

@@ -17,7 +17,7 @@ from cz_gym.body.signals import INFO_ROWS
 from cz_gym.camera.view import Camera
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.episodes.scenario import FAMILIES
-from cz_gym.episodes.scenarios import RANDOMIZED
+from cz_gym.episodes.scenarios import ALL, RANDOMIZED
 from cz_gym.physics.parameters import MACHINE, Quantity, describe
 from cz_gym.process import PULL_SCALE, Channel
 from cz_gym.puller.file import DEFAULT, value_of
@@ -174,7 +174,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "state": lambda: channels(STATE),
     "info": info,
     "crystal-measured": lambda: channels(CRYSTAL.measured),
-    "scenarios": lambda: scenario_table([s for s in SCENARIOS.values() if not s.deterministic and not _single(s)]),
+    "scenarios": lambda: scenario_table([s for s in SCENARIOS.values() if s in ALL.scenarios]),
     "plain-scenarios": lambda: scenario_table([s for s in SCENARIOS.values() if s.deterministic]),
     "single-scenarios": single_scenarios,
     "families": families,

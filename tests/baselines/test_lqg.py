@@ -7,9 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
-from cz_gym import CzVectorEnv, make_puller
+from cz_gym import SCENARIOS, CzVectorEnv, make_puller
 from cz_gym.baselines.analysis import close, linear_form
-from cz_gym.baselines.clairvoyant import fluctuations_of, pullers_of
+from cz_gym.baselines.clairvoyant import episodes_of, pullers_of
 from cz_gym.baselines.lqg import (
     LQG,
     PULL_SCALE,
@@ -27,7 +27,7 @@ from cz_gym.baselines.lqg_filter import DRIFT, FAST, HEATER, PLANT, SLOW, STATES
 from cz_gym.baselines.tuned_controllers import FACTORS, FAMILY, adaptive
 from cz_gym.body.signals import Measured, Weights, coefficients
 from cz_gym.config import make_config
-from cz_gym.episodes.scenario import Interface
+from cz_gym.episodes.scenario import Interface, Told
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.meniscus import HURLE
@@ -268,7 +268,8 @@ def test_no_lqg_loses_a_crystal(name):
 
 
 def test_an_lqg_tuned_on_nominal_hot_zones_loses_crystals_of_others_unless_it_knows_them():
-    config = make_config("hot-zone", **PLAIN)
+    over = replace(SCENARIOS["hot-zone"].pullers, boundary_layer=(0.0, 0.0))
+    config = make_config(replace(SCENARIOS["hot-zone"], pullers=over, told=Told()), **PLAIN)
     assert rollout(NOMINAL_LQG, config, CRYSTALS).failed.sum() > 2
     assert not rollout(privileged(NOMINAL_LQG, knows_fluctuations=False), config, CRYSTALS).failed.any()
 
@@ -346,7 +347,8 @@ def test_the_bounds_know_the_pullers_and_fluctuations_that_the_environment_draws
     for drawn, puller in zip(slots["puller"], pullers_of(config, seeds), strict=True):
         np.testing.assert_allclose([drawn[name] for name in puller._fields], puller, rtol=1e-12)
     drawn = np.stack([slots["episode"]["sd_fast"], slots["episode"]["sd_slow"]], axis=1)
-    np.testing.assert_array_equal(fluctuations_of(config, seeds), drawn)
+    known = [(each.sd_fast, each.sd_slow) for each in episodes_of(config, seeds)]
+    np.testing.assert_array_equal(known, drawn)
     assert len(np.unique(drawn)) == 6
 
 
@@ -354,8 +356,8 @@ def test_each_filter_has_the_noise_of_its_own_crystal():
     config = make_config("only-interface", horizon=900.0, **PLAIN)
     bound = PrivilegedLQG(design=LQGDesign(lam=1.0), knows_fluctuations=True)
     known = bound.for_episodes(config, np.arange(3)).gains.filter.plant.Q
-    for slot, (fast, slow) in enumerate(fluctuations_of(config, [0, 1, 2])):
-        noise = replace(LQGDesign().noise, fast_sd=fast, slow_sd=slow)
+    for slot, drawn in enumerate(episodes_of(config, [0, 1, 2])):
+        noise = replace(LQGDesign().noise, fast_sd=drawn.sd_fast, slow_sd=drawn.sd_slow)
         puller = pullers_of(config, [slot])[0]
         np.testing.assert_allclose(known[slot], plant_model(puller, noise, config.control_interval).Q, rtol=1e-12)
 
@@ -370,6 +372,19 @@ def test_knowing_more_lowers_error_and_activity_on_the_same_episodes(names):
     plain, privileged = found
     assert privileged.rmse_mm.mean() < plain.rmse_mm.mean()
     assert privileged.pull_step_rms_mm_per_min.mean() < plain.pull_step_rms_mm_per_min.mean()
+
+
+@pytest.mark.parametrize("name", ["lqg-true", "full-information", "clairvoyant"])
+def test_bounds_know_that_what_they_are_told_as_nominal_is_wrong(name):
+    """A wrong nominal power and temperature move none of their drives."""
+    entry, found = find_controller(name), []
+    for told in (Told(power_sd=3e3, temperature_sd=5.0), Told()):
+        scenario = replace(SCENARIOS["only-interface"], name="mine", told=told)
+        config = make_config(scenario, observation=entry.observation, action="direct", horizon=900.0)
+        found.append(rollout(entry.make(config), config, range(3)).signals)
+    for signal in ("v_p", "Q_H", "r_c"):
+        np.testing.assert_allclose(*(getattr(each, signal) for each in found), rtol=1e-5)
+    assert np.ptp(found[0].Q_H) > 1.0
 
 
 @pytest.mark.parametrize("error_pull", [None, 2e-7])

@@ -12,15 +12,14 @@ from cz_gym.baselines.lqg_filter import STATES, NoiseModel, RingModel, frequenci
 from cz_gym.baselines.tuned_controllers import BEST_RETURN
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface, Scenario, Sensor
-from cz_gym.episodes.scenarios import PULLER as PULLER_SCENARIO
-from cz_gym.episodes.scenarios import RANDOMIZED
+from cz_gym.episodes.scenarios import PULLER_FRAMES, RANDOMIZED
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.support.units import MINUTE, MM
 from tests.observed import PLAIN
 
 PULLER = make_puller(lam=0.5)
-PULLER_RING = ring_of(PULLER_SCENARIO.sensor)
+PULLER_RING = ring_of(PULLER_FRAMES.sensor)
 
 
 @pytest.mark.parametrize("latency", [0.0, 2.0, 5.0, 7.0])
@@ -94,7 +93,7 @@ def test_where_there_is_no_ripple_the_search_for_one_costs_little():
 
 
 def test_a_ripple_that_was_identified_is_left_out_of_the_radius():
-    rotation = PULLER_SCENARIO.sensor.rotation
+    rotation = PULLER_FRAMES.sensor.rotation
     found, ignored = with_and_without_search(Sensor(latency=5.0, ripple=(0.2 * MM, 0.2 * MM), rotation=rotation))
     assert found.rmse_mm.mean() < 0.75 * ignored.rmse_mm.mean()
     assert found.pull_step_rms_mm_per_min.mean() < ignored.pull_step_rms_mm_per_min.mean()

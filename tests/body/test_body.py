@@ -10,11 +10,13 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv, Parameters, State, make_puller
-from cz_gym.body.process import radius_model
+from cz_gym.body.process import BODY, OUTPUTS, linearise, radius_model
 from cz_gym.body.signals import PULL_TOLERANCE, Cost, Weights, coefficients, cost_slopes, cost_terms, reward
 from cz_gym.config import make_config
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.engine.tangents import DifferentiableBatch
-from cz_gym.episodes.scenario import Actuators
+from cz_gym.episodes.scenario import Actuators, Told
+from cz_gym.episodes.scenarios import TRACED_SLOPE
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.plant import (
     NO_DISTURBANCE,
@@ -27,7 +29,10 @@ from cz_gym.physics.plant import (
     within_limits,
 )
 from cz_gym.process import Inputs, jacobian
+from cz_gym.puller.file import PullerFile
+from cz_gym.spaces import decode
 from cz_gym.support.units import HOUR, MM
+from cz_gym.tools.registry import find_controller
 from tests.equations import Truth, design_rates, drawn, fields, hold, integrated
 from tests.observed import PLAIN
 
@@ -54,9 +59,10 @@ def drawn_inputs(rng, p, n):
 VARIED = ("sigma", "k_l", "kappa_12", "G_2b", "eps", "r_0", "v_0")
 
 
-@given(st.sampled_from(MIXES), st.lists(SPREAD, min_size=len(VARIED), max_size=len(VARIED)))
-def test_operating_point_is_a_steady_state(lam, factors):
-    q = Parameters()
+@given(st.sampled_from(MIXES), st.lists(SPREAD, min_size=len(VARIED), max_size=len(VARIED)), st.floats(0.0, 1e-3))
+def test_operating_point_is_a_steady_state(lam, factors, R):
+    """A boundary layer changes no flux at the interface, and makes the melt hotter by its own difference."""
+    q = Parameters(R=R)
     changes = {name: getattr(q, name) * factor for name, factor in zip(VARIED, factors, strict=True)}
     p = make_puller(q._replace(**changes), lam)
     rate = rates(p.state_0, p.inputs_0, NO_DISTURBANCE, p, hurle_slope)
@@ -64,12 +70,66 @@ def test_operating_point_is_a_steady_state(lam, factors):
     assert abs(rate.h_c) < 1e-12 * p.v_0
     heats = np.array([rate.T_1 * p.C_1, rate.T_2 * p.C_2, rate.T_b * p.C_b])
     assert np.abs(heats).max() < 1e-9 * p.Q_H_0
-    assert p.T_b_0 == Parameters().T_m + Parameters().dT_0
+    bare = make_puller(q._replace(R=0.0, **changes), lam)
+    assert bare.T_b_0 == q.T_m + q.dT_0
+    assert p.Phi_s == bare.Phi_s
+    assert p.T_b_0 - bare.T_b_0 == pytest.approx(R * bare.k_l * q.dT_0 / bare.h_0, rel=1e-9, abs=1e-12)
 
 
+def test_without_a_boundary_layer_hashes_and_published_functions_are_as_before():
+    """The hash with which agents and results were published; a layer has one of its own."""
+    assert make_config().plant_hash == "d59b0a9eb69b5314"
+    assert make_config(puller="germanium").puller.label == "germanium (ddb88ca42bc7e0a7)"
+    hashes = {make_config(parameters=Parameters(R=R)).plant_hash for R in (0.0, 1e-9, 7e-4)}
+    assert len(hashes) == 3
+    assert PullerFile(parameters=Parameters(R=1e-4)).hash != PullerFile().hash
+    thick = radius_model(make_puller(Parameters(R=7e-4)))
+    thin = radius_model(make_puller())
+    for name in ("numerator", "lead", "zero"):
+        assert getattr(thick, name) == pytest.approx(getattr(thin, name), rel=1e-12)
+    assert thick.poles[1] == pytest.approx(-2.2e-4, rel=0.02)
+    assert radius_model(make_puller(Parameters(R=7e-4), 0.0)).poles[1] == 0.0
+
+
+@pytest.mark.parametrize("process", [BODY, CRYSTAL])
+def test_a_controller_is_told_wrong_nominal_values_and_the_crystal_starts_in_balance(process):
+    told = replace(SCENARIOS["nominal"], told=Told(power_sd=1e3, temperature_sd=2.0))
+    found = []
+    for scenario in (told, SCENARIOS["nominal"]):
+        env = CzVectorEnv(4, scenario, "I", process=process, info="all", **PLAIN)
+        first, infos = env.reset(seed=3)
+        channels = decode(first, *env.config.ranges, process)
+        e = env._batch.memory.slots["episode"].copy()
+        _, _, _, _, after = env.step(np.zeros((4, 2)))
+        found.append((channels, infos, e, after))
+    (wrong, begun, e, after), (right, exact, _, then) = found
+    assert np.ptp(e["told_power"]) > 100.0
+    assert pytest.approx(-e["told_power"], abs=0.01) == wrong.Q_H - right.Q_H
+    assert pytest.approx(-e["told_temperature"], abs=1e-4) == wrong.T_1 - right.T_1
+    assert wrong.T_1_ref == pytest.approx(right.T_1_ref, abs=1e-4)
+    for name in ("T_1", "T_b", "Q_H", "r_c"):
+        np.testing.assert_array_equal(begun[name], exact[name])
+    assert begun["T_1_ref"] - exact["T_1_ref"] == pytest.approx(e["told_temperature"])
+    assert after["Q_H"] - then["Q_H"] == pytest.approx(e["told_power"])
+
+
+def test_the_traced_ring_is_the_plant_s_and_no_controller_s():
+    """Where rays show the edge: 2.03 mm outside the crystal, gain 0.1965, zero 0.0252 rad/s; within 2 % on Hurle's."""
+    env = CzEnv("randomized-traced", "I", **PLAIN)
+    env.reset(seed=1)
+    slot = env.get_state().slot.slot
+    assert slot["puller"]["ring_bias"] == pytest.approx(2.03e-3, rel=0.05)
+    assert find_controller("lqg").make(env.config).gains.filter.puller.ring_bias == make_puller(lam=0.5).ring_bias
+    traced = make_puller(Parameters(phi_b=TRACED_SLOPE))
+    assert traced.ring_bias == pytest.approx(2.03e-3, abs=0.005e-3)
+    assert linearise(traced).C[OUTPUTS.index("r_br"), 1] == pytest.approx(0.1965, rel=0.02)
+    assert radius_model(traced).zero == pytest.approx(0.0252, rel=0.02)
+
+
+@pytest.mark.parametrize("R", [0.0, 7e-4])
 @pytest.mark.parametrize("lam", MIXES)
-def test_rates_are_the_equations_of_the_design(lam, states, rng):
-    p = make_puller(lam=lam)
+def test_rates_are_the_equations_of_the_design(lam, R, states, rng):
+    p = make_puller(Parameters(R=R), lam)
     u, d = drawn_inputs(rng, p, 200)
     expected = design_rates(np.array(states), Truth(u.v_p, u.Q_H, d.Q_d, d.dT_i, d.melt), p)
     actual = np.array(rates(states, u, d, p, hurle_slope))

@@ -268,7 +268,8 @@ def test_every_scenario_grows_some_minutes_from_each_stage(name):
         assert not terminated.any()
         seen = decode(observation, *env.config.ranges, env.config.process)
         np.testing.assert_allclose(seen.L, info["L"], atol=1e-6)
-        np.testing.assert_allclose(seen.v_p, info["v_p"] - info["v_p_ref"], atol=1e-11)
+        misread = (e["pull_scale"] - 1.0) * info["v_p"]
+        np.testing.assert_allclose(seen.v_p, info["v_p"] - info["v_p_ref"] + misread, atol=1e-11)
     assert (np.abs(info["r_c"] - info["r_ref"]) < 3 * MM).all()
 
 

@@ -25,8 +25,9 @@ def test_trajectories_are_those_of_the_golden_file():
 
 @pytest.mark.parametrize("name", Parameters._fields)
 def test_goldens_notice_a_change_of_any_parameter(name):
-    """By a millionth: of what the plant is made of, whatever the scenario."""
-    changed = Parameters()._replace(**{name: getattr(Parameters(), name) * (1.0 + 1e-6)})
+    """By a millionth, a boundary layer by 1e-10 m2 K/W: of what the plant is made of, whatever the scenario."""
+    value = getattr(Parameters(), name)
+    changed = Parameters()._replace(**{name: value * (1.0 + 1e-6) if value else 1e-10})
     rows = np.array(trajectory("randomized", "I", changed))
     assert rows.shape == (2, len(SIGNALS) + 1)
     assert not np.allclose(rows, GOLDEN["randomized, I"], rtol=1e-9, atol=0.0)

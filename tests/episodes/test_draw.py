@@ -12,6 +12,7 @@ from scipy import stats
 
 from cz_gym import SCENARIOS, Parameters, Scenario, make_puller
 from cz_gym.episodes.draw import (
+    AVERAGING_ERROR,
     FREEZES,
     Episode,
     Factors,
@@ -20,10 +21,12 @@ from cz_gym.episodes.draw import (
     factors_from_key,
     new_series,
     randomised,
+    stream_number,
 )
 from cz_gym.episodes.rng import WORDS, next_word, normal, seed_stream, two_normals, uniform
-from cz_gym.episodes.scenario import Actuators, Faults, Interface, Reference, Sensor, TemperatureRamp, Variation
+from cz_gym.episodes.scenario import Actuators, Faults, Interface, Reference, Sensor, TemperatureRamp, Told, Variation
 from cz_gym.jit import kernel
+from cz_gym.physics.plant import ripple
 
 MM, MINUTE, SPAN = 1e-3, 60.0, 10800.0
 WORD = st.integers(0, 2**64 - 1)
@@ -43,13 +46,13 @@ def keys(n):
 
 
 WHOLE = dataclasses.replace(
-    SCENARIOS["puller"],
+    SCENARIOS["puller-frames"],
     name="whole",
     faults=SCENARIOS["sensor-fault"].faults,
     actuators=Actuators(heater_lag=(0.0, 10.0), heater_dead_time=(2.0, 5.0)),
-    sensor=dataclasses.replace(SCENARIOS["puller"].sensor, pyrometer_filter=(0.0, 20.0)),
+    sensor=dataclasses.replace(SCENARIOS["puller-frames"].sensor, pyrometer_filter=(0.0, 20.0)),
 )
-"""All of puller and sensor-fault at once, and a slow heater and pyrometer."""
+"""All of puller-frames and sensor-fault at once, and a slow heater and pyrometer."""
 DRAWN = {
     "recipe": {"recipe_duration": "duration", "recipe_start": "start"},
     "drift": {"drift_amount": "amount", "drift_duration": "duration", "drift_start": "start"},
@@ -80,12 +83,42 @@ def test_constants_are_uniform_in_their_members_ranges_and_independent():
 
 
 def test_a_slow_heater_and_pyrometer_change_no_other_draw():
-    quick = dataclasses.replace(WHOLE, actuators=Actuators(), sensor=SCENARIOS["puller"].sensor)
+    quick = dataclasses.replace(WHOLE, actuators=Actuators(), sensor=SCENARIOS["puller-frames"].sensor)
     assert not dataclasses.replace(Scenario("slow"), actuators=WHOLE.actuators).deterministic
     for key in keys(5):
         one, other = draw(WHOLE, key), draw(quick, key)
         assert one[0].heater_dead_time > 2.0
         assert same((one[0]._replace(heater_lag=0.0, heater_dead_time=0.0, pyrometer_filter=0.0), one[1]), other)
+
+
+@pytest.mark.parametrize("revolutions", [0.3, 1.0, 1.5, 4.2])
+def test_an_averaged_ring_has_the_mean_of_its_frames(revolutions):
+    """Against sums over 20,000 frames; the window is that of the episode's own stream, and no other draw changes."""
+    sensor = dataclasses.replace(SCENARIOS["puller"].sensor, averaging=revolutions)
+    averaged = dataclasses.replace(SCENARIOS["puller"], sensor=sensor)
+    for key in keys(5):
+        frame, mean = draw("puller-frames", key)[0], draw(averaged, key)[0]
+        stream = np.random.PCG64(np.random.SeedSequence(key, spawn_key=(stream_number(Stream.TOLD),)))
+        error = np.random.Generator(stream).standard_normal(3)[2]
+        window = revolutions * (1.0 + AVERAGING_ERROR * error) * 2.0 * math.pi / frame.ripple_omega
+        taken = np.array([0.0, 5.0, 1234.0])
+        before = taken[:, None] - window * (np.arange(20_000) + 0.5) / 20_000
+        np.testing.assert_allclose(ripple(taken, mean), ripple(before, frame).mean(axis=1), atol=1e-12)
+        kept = {"ripple_amplitude": 0.0, "ripple_phase": 0.0}
+        assert mean._replace(**kept) == frame._replace(**kept)
+    if revolutions == 1.0:
+        assert max(draw(averaged, key)[0].ripple_amplitude for key in keys(200)) < 0.02 * MM
+
+
+def test_told_values_err_as_said_and_change_no_other_draw():
+    exact = dataclasses.replace(SCENARIOS["hot-zone"], told=Told())
+    drawn = [draw("hot-zone", key)[0] for key in keys(1000)]
+    errors = np.array([(each.told_power, each.told_temperature) for each in drawn]) / (1000.0, 2.0)
+    for error in errors.T:
+        assert stats.kstest(error, "norm").pvalue > 1e-3
+    assert abs(np.corrcoef(errors.T)[0, 1]) < 0.1
+    for key, one in zip(keys(20), drawn, strict=False):
+        assert one._replace(told_power=0.0, told_temperature=0.0) == draw(exact, key)[0]
 
 
 @given(KEY)
@@ -191,17 +224,19 @@ def test_factors_are_uniform_and_those_of_hot_zones_log_uniform_on_the_same_crys
         np.array([factors_from_key(SCENARIOS[name], (0.0, 1.0), key) for key in keys(2000)])
         for name in ("hot-zone", "randomized")
     )
-    assert (randomized[:, 7:] == 1.0).all()
+    assert (randomized[:, 7:10] == 1.0).all()
+    assert (randomized[:, 10:] == 0.0).all()
     widths, middle = np.array([0.5, 0.03, *[0.1] * 5]), np.array([0.5, *[1.0] * 6])
     check_uniform(0.5 + 0.5 * (randomized[:, :7] - middle) / widths)
     np.testing.assert_array_equal(hot_zone[:, :3], randomized[:, :3])
     slow, quick = draw("hot-zone", (5, 6))[0], draw("randomized", (5, 6))[0]
-    assert slow == quick._replace(heater_lag=slow.heater_lag, pyrometer_filter=slow.pyrometer_filter)
+    own = {name: getattr(slow, name) for name in ("heater_lag", "pyrometer_filter", "told_power", "told_temperature")}
+    assert slow == quick._replace(**own)
     assert 0.0 < slow.heater_lag < 10.0
     assert 0.0 < slow.pyrometer_filter < 20.0
     low = np.log([0.75] * 4 + [0.5, 0.5, 0.7])
     high = np.log([1.33] * 4 + [2.0, 2.0, 1.4])
-    check_uniform((np.log(hot_zone[:, 3:]) - low) / (high - low))
+    check_uniform(np.c_[(np.log(hot_zone[:, 3:10]) - low) / (high - low), hot_zone[:, 10] / 8e-4])
 
 
 def check_uniform(columns):

@@ -19,9 +19,10 @@ from cz_gym.support.errors import CzError
 FROZEN = {
     "nominal": "470ebb0cf8fc46d8", "paper-ramp": "00726411751b722d", "reference-a": "c61db8d3195dde7b",
     "reference-b": "fafc6c06ed88de8b", "randomized": "28ec8d2bf14b3b7b", "hard": "f3b0f280a51eb76d",
-    "sensor-fault": "a2ba81372aa15e66", "puller": "2104861fe7b255c8", "hot-zone": "557eb17e2c25ee09",
+    "sensor-fault": "a2ba81372aa15e66", "puller": "c0609b6094256346", "hot-zone": "ea4fb6000736f296",
     "only-recipe": "986d178b78f3b36e", "only-drift": "35df8d2d49bfbfbe", "only-interface": "8b4a530df4f47e75",
     "only-sensor": "bb58fef8179b8f19", "only-reference": "7e3a5668784daa66", "only-parameters": "6702460317bfa4ff",
+    "puller-frames": "c2238e9f40904c19", "melt-layer": "d2a0b9ede38c1c76", "randomized-traced": "8a2bdc0f93627159",
 }  # fmt: skip
 MEMBERS = Scenario("plain").members
 

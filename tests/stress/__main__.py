@@ -142,7 +142,7 @@ class Watch:
 
     def _check_drives(self, ran, actions, infos):
         p, e, old = self._slots["puller"], self._slots["episode"], self._old
-        pull, power = infos["v_p"] - p["v_0"], infos["Q_H"] - p["Q_H_0"]
+        pull, power = infos["v_p"] - p["v_0"], infos["Q_H"] - (p["Q_H_0"] + e["told_power"])
         widest = np.minimum(p["v_0"], e["pull_window"]) * (1.0 + _EPS)
         self._need(np.abs(pull) <= widest, "the pull speed leaves its range")
         self._need(infos["Q_H"] >= 0.0, "the heater cools")

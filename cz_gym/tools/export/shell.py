@@ -268,7 +268,7 @@ class Block:
         at = [STATES.index(name) for name in TEMPERATURES]
         A, B = hot.A[np.ix_(at, at)], hot.B[at, COLUMNS.index("Q_H")]
         T_1, _, T_b = -np.linalg.solve(A, B)
-        pull = T_b * puller.k_l / (puller.v_0 * puller.rho_dH * puller.h_0)
+        pull = T_b * puller.k_l / (puller.v_0 * puller.rho_dH * (puller.h_0 + puller.layer))
         slow = -1.0 / float(np.linalg.eigvals(A).real.max())
         noise = max(each.sensor.pyrometer_noise[1] for each in config.scenario.scenarios)
         trim, nominal = slow / (pull * SLOWER * PULL_BIAS_TIME), (puller.v_0 / MM_PER_MIN, puller.Q_H_0 / KILO)
