@@ -3,11 +3,14 @@
 It stands beside the package, whose import takes a second: help comes at once, and Ctrl-C during the import is one line.
 """
 
+import os
 import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import version
+from io import TextIOWrapper
+from threading import Timer
 
 COMMANDS = {
     "train": ("cz_gym.tools.train", "train an agent by a recipe"),
@@ -22,6 +25,8 @@ COMMANDS = {
     "data": ("cz_gym.tools.datasets", "record datasets for offline learning"),
 }
 """For each word its module, whose ``main`` takes the arguments after it, and what it does."""
+SOON = 0.5
+"""Time after which a command says that it loads [s]."""
 HELP = "\n".join([
     "usage: cz-gym COMMAND ...; cz-gym COMMAND --help has its options",
     "",
@@ -31,6 +36,27 @@ HELP = "\n".join([
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit code, 2 for a word that is none, 130 when its import is interrupted."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal of ASCII shows question marks
+    try:
+        try:
+            return _run(arguments)
+        finally:
+            sys.stdout.flush()
+    except OSError as error:
+        try:
+            sys.stdout.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            if isinstance(error, BrokenPipeError):
+                return 141
+            print(f"cz-gym: the output cannot be written: {error.strerror}", file=sys.stderr)
+            return 2
+        raise
+
+
+def _run(arguments: Sequence[str] | None) -> int:
     word, *others = [*(sys.argv[1:] if arguments is None else arguments), "--help"]
     if word in ("-h", "--help"):
         print(HELP)
@@ -43,6 +69,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         meant = f": did you mean {close[0]!r}? Choose" if close else "; choose"
         print(f"cz-gym: unknown command {word!r:.80}{meant} from {', '.join(COMMANDS)}", file=sys.stderr)
         return 2
+    loading = Timer(SOON, print, [f"cz-gym {word}: loading its packages"], {"file": sys.stderr, "flush": True})
+    loading.daemon = True
+    loading.start()
     try:
         module = import_module(COMMANDS[word][0])
     except KeyboardInterrupt:
@@ -54,5 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         extra = ': pip install ".[benchmark]"' if error.name in ("matplotlib", "plotly", "tqdm") else ""
         print(f"cz-gym {word}: {error}{extra}", file=sys.stderr)
         return 2
+    finally:
+        loading.cancel()
     code: int = module.main(others[:-1])
     return code

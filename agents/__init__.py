@@ -8,6 +8,7 @@ if __name__ != "cz_gym.agents":
     raise ImportError("import cz_gym.agents: the folder agents is that package, under no other name")
 
 from pathlib import Path
+from typing import Any
 
 from cz_gym.config import Config
 from cz_gym.crystal.process import ENVIRONMENTS
@@ -15,7 +16,16 @@ from cz_gym.support.errors import unknown_name_message
 
 from .contract import AgentFileError, Contract, OnnxPolicy, read_agent
 
-__all__ = ["AgentFileError", "Contract", "OnnxPolicy", "load", "shipped", "shipped_names", "shipped_seeds"]
+__all__ = [
+    "AgentFileError",
+    "Contract",
+    "OnnxPolicy",
+    "load",
+    "save_agent",
+    "shipped",
+    "shipped_names",
+    "shipped_seeds",
+]
 
 MODELS = Path(__file__).parent / "models"
 DEFAULT = "gradient"
@@ -36,6 +46,14 @@ def load(name: str | Path = DEFAULT, config: Config | None = None) -> OnnxPolicy
                 f"make_config(..., {setting}={value!r}) fits"
             )
     return policy
+
+
+def __getattr__(name: str) -> Any:
+    if name == "save_agent":  # it needs torch
+        from .from_torch import save_agent
+
+        return save_agent
+    raise AttributeError(f"module 'cz_gym.agents' has no attribute {name!r}")
 
 
 def shipped_names(environment: str = "Cz-v0") -> list[str]:

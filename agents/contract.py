@@ -6,6 +6,7 @@ import math
 import os
 import stat
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Self
@@ -20,6 +21,7 @@ from cz_gym.spaces import ACTIONS, CLIP, TargetEnv, observations, tag
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import write_files
 
+from .exported import to_plain
 from .graph import GraphError, check_graph
 
 FORMAT = "cz-gym-agent"
@@ -79,6 +81,11 @@ class Contract:
     environment: str = "Cz-v0"
     """Name of the environment that it was trained in."""
 
+    @property
+    def hash(self) -> str:
+        """SHA-256 of the network and of every other field: what the file does, and what it declares (64 hex digits)."""
+        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
+
 
 ADDED_FIELDS = {"puller": DEFAULT.label, "environment": "Cz-v0"}
 """Fields that older files do not have, with the values that hold for those."""
@@ -121,15 +128,32 @@ def make_contract(onnx_bytes: bytes, **facts: Any) -> Contract:
 
 def agent_files(path: Path, onnx_bytes: bytes, contract: Contract) -> dict[Path, bytes]:
     """Contents of the files ``path`` (.onnx) and its contract (.json)."""
-    text = json.dumps({"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(contract)}, indent=2) + "\n"
+    content = {"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(contract), "hash": contract.hash}
+    text = json.dumps(content, indent=2) + "\n"
     return {path: onnx_bytes, path.with_suffix(".json"): text.encode()}
 
 
-def write_agent(path: Path, onnx_bytes: bytes, **facts: Any) -> Contract:
-    """Write an agent file with its contract; ``facts`` as for :func:`make_contract`."""
-    contract = make_contract(onnx_bytes, **facts)
-    write_files(agent_files(path, onnx_bytes, contract))
+def write_agent(path: Path, onnx_bytes: bytes | Path, **facts: Any) -> Contract:
+    """Write an agent file with its contract; ``facts`` as for :func:`make_contract`.
+
+    The ONNX model, or its file, may be any exporter's (:mod:`cz_gym.agents.exported`); a graph that agents may not have
+    is told where it is loaded.
+    """
+    content = plain_graph(onnx_bytes, facts["channels"])
+    contract = make_contract(content, **facts)
+    write_files(agent_files(path, content, contract))
     return contract
+
+
+def plain_graph(source: bytes | Path, channels: int) -> bytes:
+    """An ONNX model, or its file, as an agent's graph; as it is where it is one, or cannot become one."""
+    content = source.read_bytes() if isinstance(source, Path) else source
+    try:
+        check_graph(content, channels)
+    except GraphError:
+        with suppress(GraphError):
+            return to_plain(source, channels)
+    return content
 
 
 def read_agent(path: Path) -> tuple[Contract, bytes]:
@@ -181,6 +205,7 @@ def _parse(path: Path) -> Contract:
     wanted = {field.name for field in fields(Contract)}
     given = {**ADDED_FIELDS, **data}
     del given["format"], given["format_version"]
+    given.pop("hash", None)
     if set(given) != wanted:
         odd = sorted(set(given) ^ wanted)[0]
         raise AgentFileError(f"{path}: field {odd!r:.80} is {'missing' if odd in wanted else 'unknown'}")
@@ -234,7 +259,11 @@ class OnnxPolicy:
         if path.suffix != ".onnx":
             said = f"{path}: not an .onnx agent file; cz_gym.agents.load({str(path)!r}) loads a shipped agent"
             raise AgentFileError(said)
-        return cls.of(*read_agent(path), config, path)
+        policy = cls.of(*read_agent(path), config, path)
+        written = read_json(path.with_suffix(".json")).get("hash", policy.contract.hash)
+        if written != policy.contract.hash:
+            raise AgentFileError(f"{path.with_suffix('.json')}: changed after it was written (its hash differs)")
+        return policy
 
     @classmethod
     def of(

@@ -5,17 +5,14 @@ model is a pickle, and reading one can run any code: convert only what you train
 """
 
 import argparse
-import io
 import pkgutil
 import re
 import sys
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import onnx
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
@@ -35,7 +32,7 @@ from cz_gym.support.files import write_files
 from .apg import APG, RecurrentPolicy
 from .asymmetric import Asymmetric
 from .contract import AgentFileError, Contract, OnnxPolicy, agent_files, facts_of, make_contract
-from .graph import INPUTS, OUTPUTS
+from .from_torch import export
 from .recipes import JUDGING_SEEDS, validate
 
 ALGORITHMS = {
@@ -167,9 +164,6 @@ def _check_wrappers(model: BaseAlgorithm) -> None:
             )
 
 
-OPSET, IR_VERSION = 17, 9
-
-
 class DeterministicActor(nn.Module):
     """Deterministic action of a policy, clipped to [-1, 1], for observations as the environment gives them.
 
@@ -239,36 +233,11 @@ def lstm_step(x: torch.Tensor, state: torch.Tensor, lstm: nn.LSTM) -> tuple[torc
 
 
 def to_onnx(policy: BasePolicy, channels: int, normalisation: VecNormalize | None = None) -> bytes:
-    """Export a policy as a serialised ONNX model; AgentFileError if that cannot be done.
-
-    torch's older exporter: the newer one needs more packages and takes a second.
-    """
+    """Export a policy as a serialised ONNX model; AgentFileError if that cannot be done."""
     policy.set_training_mode(False)
     module = DeterministicActor(policy, normalisation).eval()
     examples = [torch.zeros(2, channels), torch.zeros(2, module.memory)][: 2 if module.memory else 1]
-    inputs, outputs = (list(names[: len(examples)]) for names in (INPUTS, OUTPUTS))
-    rows = {name: {0: "n"} for name in (*inputs, *outputs)}
-    file: Any = io.BytesIO()
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that it is the older one, and of values it takes as constants
-            torch.onnx.export(
-                module, tuple(examples), file, dynamo=False, opset_version=OPSET, input_names=inputs,
-                output_names=outputs, dynamic_axes=rows,
-            )  # fmt: skip
-    except (torch.onnx.errors.OnnxExporterError, RuntimeError, TypeError, NotImplementedError) as error:
-        raise AgentFileError(f"{type(policy).__name__} cannot be written as an agent file: {error}") from None
-    model = onnx.load_from_string(file.getvalue())
-    weights = [node for node in model.graph.node if node.op_type == "Constant"]
-    for node in weights:
-        value = node.attribute[0].t
-        value.name = node.output[0]
-        model.graph.initializer.append(value)
-        model.graph.node.remove(node)
-    model.ir_version = IR_VERSION
-    onnx.checker.check_model(model)
-    serialised: bytes = model.SerializeToString()
-    return serialised
+    return export(module, examples, type(policy).__name__)
 
 
 def to_agent(

@@ -146,6 +146,11 @@ class MeasuredController(ABC):
         ).made_for
 
     @property
+    def observations(self) -> tuple[str, ...]:
+        """Observations that it reads: who reads "measured" reads it in "history" too."""
+        return ("measured", "history") if self.observation == "measured" else (self.observation,)
+
+    @property
     def settings(self) -> dict[str, Any]:
         """Arguments of ``gym.make("Cz-v0", ...)`` for the environment that it was made for."""
         given = {"observation": self.observation, "action": self.action, "control_interval": self.control_interval}

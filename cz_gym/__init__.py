@@ -28,6 +28,7 @@ from cz_gym.physics.plant import Puller, State, make_puller
 from .config import Config
 from .env import CzEnv, CzVectorEnv, EnvState
 from .spaces import decode
+from .vector_checker import check_vector_env
 
 
 def _beside(name: str, *_: object) -> ModuleSpec | None:
@@ -57,6 +58,7 @@ __all__ = [
     "Puller",
     "Scenario",
     "State",
+    "check_vector_env",
     "decode",
     "make_puller",
 ]

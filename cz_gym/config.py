@@ -3,8 +3,9 @@
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from functools import lru_cache
 from numbers import Integral, Real
 from pathlib import Path
@@ -14,12 +15,14 @@ import numpy as np
 
 from cz_gym.body.process import BODY
 from cz_gym.camera.view import Camera, camera_for, check_camera
+from cz_gym.crystal.plant import CrystalParameters
+from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.episodes.draw import Factors
-from cz_gym.episodes.scenario import AnyScenario, Distribution, Scenario
+from cz_gym.episodes.scenario import FAMILIES, AnyScenario, Distribution, Mixture, Scenario
 from cz_gym.episodes.scenarios import RANDOMIZED, adapt_scenario, find_distribution, find_scenario, mix_of
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.parameters import Parameters, Range
-from cz_gym.puller.file import DEFAULT, PullerFile, find_puller
+from cz_gym.puller.file import DEFAULT, PullerFile, find_puller, to_toml
 from cz_gym.support.errors import CzError, require_type, unknown_name_message
 
 from .process import Inputs, Process
@@ -163,7 +166,7 @@ class Config:
 
     def with_scenario(self, scenario: AnyScenario) -> Self:
         """The same settings on another scenario or mixture, which is adapted to the puller."""
-        return replace(self, scenario=adapt_scenario(self.puller, find_distribution(scenario)))
+        return replace(self, scenario=adapt_scenario(self.puller, find_distribution(_scenario_of(scenario))))
 
 
 def check_config(config: Config) -> Config:
@@ -181,39 +184,124 @@ def make_config(
     observation: str = "history",
     control_interval: float | None = None,
     horizon: float | None = None,
-    parameters: Parameters | None = None,
-    meniscus: MeniscusModel | None = None,
-    camera: Camera | None = None,
+    parameters: Parameters | Mapping[str, float] | None = None,
+    meniscus: MeniscusModel | str | None = None,
+    camera: Camera | Mapping[str, float] | None = None,
     action: str = "smooth",
     puller: str | Path | PullerFile | None = None,
-    process: Process | None = None,
+    process: Process | str | None = None,
     weights: Mapping[str, float] | None = None,
     stage: Any = None,
 ) -> Config:
-    """Check the arguments of the environment; CzError names what was given and what is allowed."""
-    machine, process = find_puller(puller), require_type(Process, process or BODY, "cz_gym.body.process.BODY is one")
+    """Check the arguments of the environment; CzError names what was given and what is allowed.
+
+    Each may have the form that :func:`as_json` gives it.
+    """
+    named: Any = ENVIRONMENTS.get(process, process) if isinstance(process, str) else process or BODY
+    simulated: Process = require_type(Process, named, "cz_gym.body.process.BODY is one")
+    machine, meniscus = find_puller(puller), _find_meniscus(meniscus)
+    scenario, parameters = _scenario_of(scenario), _fields_of((Parameters, CrystalParameters), parameters)
+    seen: Camera | None = _fields_of((Camera,), camera)
     if puller is not None and parameters is not None:
         raise CzError(f"parameters are those of the puller {machine.name!r}: give one of both")
     drawn_from = adapt_scenario(machine, find_distribution(scenario))
     mix_of(model, drawn_from)
-    _check_modes(observation, action, camera)
+    _check_modes(observation, action, seen)
     interval = positive("control_interval", machine.control_interval if control_interval is None else control_interval)
     shape = meniscus or HURLE
     if not isinstance(shape, MeniscusModel):
         raise CzError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
     given = machine.parameters if parameters is None else parameters
-    checked = process.check(process.complete(given, machine, stage), shape)
-    length = positive("horizon", process.duration(checked, shape, interval) if horizon is None else horizon)
+    checked = simulated.check(simulated.complete(given, machine, stage), shape)
+    length = positive("horizon", simulated.duration(checked, shape, interval) if horizon is None else horizon)
     steps = length / interval
     if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
         raise CzError(f"horizon {length:g} s must be a whole number of control intervals of {interval:g} s")
-    checked_camera = check_camera(camera_for(checked) if camera is None else camera, checked)
+    checked_camera = check_camera(camera_for(checked) if seen is None else seen, checked)
     return Config(
         *(drawn_from, model, observation, action, interval, length, checked, shape, checked_camera),
         puller=machine,
-        process=process,
-        weights=process.weights if weights is None else _weights(weights, process.weights),
+        process=simulated,
+        weights=simulated.weights if weights is None else _weights(weights, simulated.weights),
     )
+
+
+MENISCI = HURLE.name, "young-laplace"
+"""Names of the menisci of this package."""
+
+
+def _find_meniscus(given: Any) -> Any:
+    """The meniscus of a name; anything else as it is."""
+    if given != MENISCI[1]:
+        return HURLE if given == HURLE.name else given
+    from cz_gym.physics.young_laplace import YOUNG_LAPLACE  # it reads tables that are seldom needed
+
+    return YOUNG_LAPLACE
+
+
+def as_json(value: Any) -> Any:
+    """An argument of the environment, or a dict or list of them, as JSON that :func:`make_config` reads as the same.
+
+    A scenario becomes a dict of its name and of its numbers off their defaults, a mixture one of its scenarios and
+    their shares, a puller the text of its file. A process or a meniscus of the user's own stays as it is.
+    """
+    if isinstance(value, Scenario):
+        numbers: dict[str, Any] = {"name": value.name, "series": as_json(value.series)} if value.series else {}
+        for family, each, number in value.members:
+            if number != each.default:
+                numbers.setdefault(family, {})[each.name] = as_json(number)
+        return {"name": value.name, **numbers}
+    if isinstance(value, Mixture):
+        return {"scenarios": as_json(value.scenarios), "shares": list(value.shares)}
+    if isinstance(value, Mapping):
+        if all(isinstance(key, str) for key in value):
+            return {str(key): as_json(each) for key, each in value.items()}
+        return as_json(find_distribution(value))
+    if isinstance(value, MeniscusModel):
+        return value.name if value.name in MENISCI and _find_meniscus(value.name) == value else value
+    if isinstance(value, Process):
+        return value.name if ENVIRONMENTS.get(value.name) == value else value
+    if isinstance(value, PullerFile):
+        return to_toml(value)
+    if isinstance(value, Path | Enum):
+        return str(value) if isinstance(value, Path) else value.value
+    if hasattr(value, "_asdict"):
+        return as_json(value._asdict())
+    if isinstance(value, tuple | list | np.ndarray):
+        return [as_json(each) for each in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _scenario_of(given: Any) -> Any:
+    """A scenario or mixture in JSON's form (:func:`as_json`) as such; anything else as it is."""
+    if not isinstance(given, Mapping):
+        return given
+    if isinstance(given.get("shares"), list) and isinstance(given.get("scenarios"), list):
+        return Mixture(tuple(map(_scenario_of, given["scenarios"])), tuple(given["shares"]))
+    if not isinstance(given.get("name"), str):
+        return given
+    parts: dict[str, Any] = {"name": given["name"]}
+    for family, numbers in given.items():
+        if family == "series":
+            parts[family] = tuple(map(tuple, numbers))
+        elif family != "name":
+            if family not in FAMILIES:
+                raise CzError(unknown_name_message("family of a scenario", family, FAMILIES))
+            known = FAMILIES[family].__dataclass_fields__
+            for name in require_type(Mapping, numbers, "{'camera_noise': [0.0, 5e-5]}"):
+                if name not in known:
+                    raise CzError(unknown_name_message(f"number of {family}", name, known))
+            pairs = {name: tuple(each) if isinstance(each, list) else each for name, each in numbers.items()}
+            parts[family] = FAMILIES[family](**pairs)
+    return Scenario(**parts)
+
+
+def _fields_of(kinds: Sequence[Any], given: Any) -> Any:
+    """A record of numbers, of one of these kinds, given as a mapping of its fields; anything else as it is."""
+    for kind in kinds if isinstance(given, Mapping) else ():
+        if set(given) == set(kind._fields):
+            return kind(**given)
+    return given
 
 
 def _check_modes(observation: Any, action: Any, camera: Camera | None) -> None:

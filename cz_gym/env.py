@@ -7,7 +7,7 @@
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from inspect import Signature, signature
 from typing import Any, Self
 
@@ -27,12 +27,13 @@ from cz_gym.rendering.canvas import Frame
 from cz_gym.rendering.picture import FPS, View, declared_modes, make_view
 from cz_gym.support.errors import CzError, check_keywords, unknown_name_message
 
-from .config import Config, check_config, make_config, positive_whole
+from .config import Config, as_json, check_config, make_config, positive_whole
 from .spaces import TaggedAction, action_space, check_action, check_actions, check_tagged, observation_space
 
 Array = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
-_PLAIN = np.float64, np.bool_, float, bool, str
+APART = 128
+"""Bits of an integer seed of a batch: slot i has the seed of the scalar form ``seed + ((i + 1) << APART)``."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,10 @@ class EnvState:
 
     slot: SlotState
     random: dict[str, Any]
+
+    def copy(self) -> Self:
+        """A copy that shares nothing with this state."""
+        return deepcopy(self)
 
 
 def shows_settings(cls: Any) -> Any:
@@ -63,24 +68,41 @@ class EnvBase:
     """Attributes that are pickled besides settings and slots."""
     config: Config
     """The checked settings."""
+    action_repeat: int
+    """Control intervals that an action is held for."""
     _setup: Any
     _settings: tuple[Any, ...]
     _view: View | None = None
+    _spec: Any = None
+
+    @property
+    def spec(self) -> Any:
+        """Gymnasium's specification; its arguments are JSON, so that ``spec.to_json()`` makes the environment again."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: Any) -> None:
+        self._spec = spec and replace(spec, kwargs=as_json(spec.kwargs))
 
     @classmethod
     def from_config(cls, config: Config, *settings: Any, **named: Any) -> Self:
         """Make the environment from settings that :func:`cz_gym.config.make_config` has checked.
 
-        The other arguments are ``render_mode``, ``render_size`` and ``info`` for :class:`CzEnv`, and ``num_envs``,
-        ``autoreset_mode``, ``threads`` and ``info`` for :class:`cz_gym.CzVectorEnv`.
+        The other arguments are ``render_mode``, ``render_size``, ``info`` and ``action_repeat`` for :class:`CzEnv`, and
+        ``num_envs``, ``autoreset_mode``, ``threads``, ``info`` and ``action_repeat`` for :class:`cz_gym.CzVectorEnv`.
         """
         env = cls.__new__(cls)
         env._setup(check_config(config), *settings, **named)
         return env
 
-    def _prepare(self, config: Config, num_envs: int, threads: int, everything: bool, recorded: bool = False) -> None:
+    def _prepare(
+        self, config: Config, num_envs: int, threads: int, info: str, action_repeat: int, recorded: bool = False
+    ) -> None:
         """Make the slots; ``recorded``: all rows of ``info`` are written, whether or not they are returned."""
-        self.config, self._made_for, self._everything = config, config.made_for, everything
+        self.config, self._made_for, self._everything = config, config.made_for, (everything := check_info(info))
+        self.action_repeat = positive_whole("action_repeat", action_repeat)
+        rows = config.process.info
+        self._clipped, self._cost = rows.index("action_clipped"), rows.index("cost") if "cost" in rows else None
         self._batch = Batch(config, num_envs, threads, everything or recorded)
         self._out = self._batch.new_out()
         self._begun, self._named = False, isinstance(config.scenario, Mixture)
@@ -173,6 +195,8 @@ class CzEnv(EnvBase, gym.Env[Array, Array]):
     shipped one; see docs/extend/puller.md: parameters and control interval are then its own), ``process`` (what is
     simulated, :class:`cz_gym.process.Process`), ``weights`` (those of the reward's terms that are not the usual ones,
     ``{"pull": 0.1}``; :class:`cz_gym.body.signals.Weights`). Bad values raise ValueError.
+    ``action_repeat`` holds every action for so many control intervals, or until the episode ends: the reward and
+    ``info["cost"]`` are the sums of theirs.
     ``render_mode`` is None, "rgb_array" or "human", ``render_size`` the picture's width and height [px]; rendering
     needs the extra ``render``, without which no mode is declared and asking for one raises
     :class:`gymnasium.error.DependencyNotInstalled`.
@@ -187,16 +211,22 @@ class CzEnv(EnvBase, gym.Env[Array, Array]):
         render_mode: str | None = None,
         render_size: tuple[int, int] = (640, 480),
         info: str = "lean",
+        action_repeat: int = 1,
         **named: Any,
     ) -> None:
         check_keywords(named, make_config, CzEnv.__init__)
-        self._setup(make_config(*settings, **named), render_mode, render_size, info)
+        self._setup(make_config(*settings, **named), render_mode, render_size, info, action_repeat)
 
     def _setup(
-        self, config: Config, render_mode: str | None = None, render_size: Any = (640, 480), info: str = "lean"
+        self,
+        config: Config,
+        render_mode: str | None = None,
+        render_size: Any = (640, 480),
+        info: str = "lean",
+        action_repeat: int = 1,
     ) -> None:
-        self._settings = config, render_mode, render_size, info
-        self._prepare(config, 1, 1, check_info(info), recorded=render_mode is not None)
+        self._settings = config, render_mode, render_size, info, action_repeat
+        self._prepare(config, 1, 1, info, action_repeat, recorded=render_mode is not None)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_modes": declared_modes(config.process)}
         self.action_space = action_space()
@@ -205,7 +235,7 @@ class CzEnv(EnvBase, gym.Env[Array, Array]):
         self._shown = self._batch.shown(self._out)[0]
         self._signals, self._valid = self._out.info[:, 0], self._slots["valid"]
         self._step = self._batch.bound_step(self._action, self._out)
-        self._names, self._clipped = config.process.info, config.process.info.index("action_clipped")
+        self._names = config.process.info
         self._lean = tuple((name, self._names.index(name)) for name in config.process.BriefInfo._fields)
         self._view = make_view(render_mode, render_size, self.config)
 
@@ -229,7 +259,7 @@ class CzEnv(EnvBase, gym.Env[Array, Array]):
         return self._shown.copy(), self._info()
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Hold an action, shape (2,), for one control interval; see :class:`gymnasium.Env`.
+        """Hold an action, shape (2,), for ``action_repeat`` control intervals; see :class:`gymnasium.Env`.
 
         Raises InvalidAction for NaN, another shape, and an action made for another environment (:mod:`cz_gym.spaces`);
         ResetNeeded once the episode is over.
@@ -239,13 +269,19 @@ class CzEnv(EnvBase, gym.Env[Array, Array]):
         if type(action) is TaggedAction:
             check_tagged(action, self._made_for)
         self._action[0] = check_action(action)
-        self._step()
-        out = self._out
-        terminated, truncated = out.terminated.item(), out.truncated.item()
-        self._over = terminated or truncated
-        if self._view is not None:
-            self._view.add(self._signals, self._valid.item(), terminated, truncated)
-        return self._shown.copy(), out.reward.item(), terminated, truncated, self._info()
+        out, reward, cost = self._out, 0.0, 0.0
+        for _ in range(self.action_repeat):
+            self._step()
+            terminated, truncated = out.terminated.item(), out.truncated.item()
+            self._over, reward = terminated or truncated, reward + out.reward.item()
+            if self._view is not None:
+                self._view.add(self._signals, self._valid.item(), terminated, truncated)
+            if self._cost is not None:
+                cost += self._signals[self._cost]
+                self._signals[self._cost] = cost
+            if self._over:
+                break
+        return self._shown.copy(), reward, terminated, truncated, self._info()
 
     def get_state(self) -> EnvState:
         """A picklable value from which :meth:`set_state` continues bit-exactly, random stream included.
@@ -281,15 +317,12 @@ class CzEnv(EnvBase, gym.Env[Array, Array]):
         self._batch.close()
 
     def _info(self) -> dict[str, Any]:
+        """A plain dictionary with the same keys at every step, as recorders and trees of arrays need it."""
         if self._everything:
-            info = Info(zip(self._names, self._signals, strict=True))
-            info["action_clipped"] = bool(info["action_clipped"] > 0.0)
+            info = dict(zip(self._names, self._signals, strict=True))
         else:
-            info = Info()
-            for name, row in self._lean:
-                info[name] = self._signals[row]
-            if self._signals.item(self._clipped) > 0.0:
-                info["action_clipped"] = True
+            info = {name: self._signals[row] for name, row in self._lean}
+        info["action_clipped"] = self._signals.item(self._clipped) > 0.0
         if self._named:
             info["scenario"] = self._batch.scenarios[0]
         if self._everything and self.config.observation == "history":
@@ -297,19 +330,9 @@ class CzEnv(EnvBase, gym.Env[Array, Array]):
         return info
 
 
-class Info(dict[str, Any]):
-    """A step's ``info`` with a fast deep copy: stable-baselines3 makes one at every step."""
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        for value in self.values():
-            if type(value) not in _PLAIN:
-                return type(self)(deepcopy(dict(self), memo))
-        return type(self)(self)
-
-
 @shows_settings
 class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
-    """Many pullers at once in one compiled loop; slot i with seed s equals :class:`CzEnv` with seed s bit for bit.
+    """Many pullers at once in one compiled loop; slot i with seed s[i] equals :class:`CzEnv` with it bit for bit.
 
     Arguments are those of :class:`CzEnv`, with ``num_envs``, ``autoreset_mode`` (a
     :class:`gymnasium.vector.AutoresetMode` or its value; each episode is re-drawn from the slot's own stream) and
@@ -328,13 +351,14 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         threads: int | None = None,
         info: str = "lean",
         render_mode: str | None = None,
+        action_repeat: int = 1,
         **named: Any,
     ) -> None:
         check_keywords(named, make_config, CzVectorEnv.__init__)
         config = make_config(*settings, **named)
         if render_mode is not None:
             raise CzError(f"a batch does not render: render_mode must be None, not {render_mode!r}")
-        self._setup(config, num_envs, autoreset_mode, threads, info)
+        self._setup(config, num_envs, autoreset_mode, threads, info, action_repeat)
 
     def _setup(
         self,
@@ -343,8 +367,9 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         threads: int | None = None,
         info: str = "lean",
+        action_repeat: int = 1,
     ) -> None:
-        self._settings, everything = (config, num_envs, autoreset_mode, threads, info), check_info(info)
+        self._settings = config, num_envs, autoreset_mode, threads, info, action_repeat
         self.num_envs = num_envs = positive_whole("num_envs", num_envs)
         threads = processors() if threads is None else positive_whole("threads", threads)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -354,9 +379,9 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         self.single_observation_space = observation_space(config.observation, config.process)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._prepare(config, num_envs, threads, everything)
-        rows, brief = config.process.info, config.process.BriefInfo._fields
-        self._clipped, self._names = rows.index("action_clipped"), rows if everything else brief
+        self._prepare(config, num_envs, threads, info, action_repeat)
+        rows = config.process.info
+        self._names = rows if self._everything else config.process.BriefInfo._fields
         self._rows = tuple(map(rows.index, self._names))
         self._masks = tuple(f"_{name}" for name in self._names)
         self._everybody: Mask = np.ones(num_envs, np.bool_)
@@ -365,14 +390,19 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         self._seeds: list[int | None] = [None] * num_envs
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: Any = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Draw episodes; slot i is seeded with seed + i, or with seed[i].
+        """Draw episodes; slot i is seeded with seed[i], as the scalar form is.
+
+        A single seed is the batch's own: its episodes are those of no seed below 2**128 of the scalar form, so that
+        none of validation or test is among them (slot i has the scalar's seed ``seed + ((i + 1) << 128)``).
 
         ``options={"scenario": ...}`` draws these episodes from another scenario or mixture, ``{"state": states}`` goes
-        on from a value of :meth:`get_state`, ``{"reset_mask": mask}`` resets only some slots. Raises ValueError or
-        TypeError for anything else.
+        on from a value of :meth:`get_state`, ``{"reset_mask": mask}`` resets only some slots. A list has the options of
+        :meth:`CzEnv.reset`, one a slot. Raises ValueError or TypeError for anything else.
         """
+        if isinstance(options, Sequence) and not isinstance(options, str):
+            return self._reset_each(seed, options)
         given = self._checked(options, "scenario", "state", "reset_mask")
         mask = self._reset_mask(given.get("reset_mask"))
         if "state" in given:
@@ -393,8 +423,28 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         self._begin()
         return self._observations(), self._infos(self._out, mask)
 
+    def _reset_each(self, seed: Any, options: Sequence[Any]) -> tuple[Array, dict[str, Any]]:
+        """Draw episodes with options for each slot."""
+        if len(options) != self.num_envs:
+            raise CzError(f"expected options for {self.num_envs} slots, got {len(options)}")
+        given = [self._checked(own, "scenario", "state") for own in options]
+        for own in given:
+            if "state" in own:
+                self._check_state(own["state"])
+        self._seed(seed, self._everybody)
+        self._out = self._batch.new_out()
+        for i, own in enumerate(given):
+            if "state" in own:
+                self._batch.restore([i], [own["state"].slot], self._out)
+                self._random(i).bit_generator.state = own["state"].random
+            else:
+                self._draw([i], self._out, own.get("scenario"))
+                self._named |= isinstance(own.get("scenario"), Mixture)
+        self._begin()
+        return self._observations(), self._infos(self._out)
+
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Hold actions, shape (num_envs, 2), for one control interval in every slot.
+        """Hold actions, shape (num_envs, 2), for ``action_repeat`` control intervals in every slot.
 
         Raises InvalidAction for NaN, another shape, and an action made for another environment (:mod:`cz_gym.spaces`);
         ResetNeeded before the first reset and, with autoreset disabled, while any episode is over.
@@ -409,11 +459,9 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
             raise ResetNeeded(f"{int(self._over.sum())} episodes are over: reset them with options['reset_mask']")
         out = self._out = self._batch.new_out()
         infos: dict[str, Any] = {}
+        ended = self._hold(actions, out, ~self._over if waiting else None)
         if waiting:
-            ended = self._batch.step(actions, out, ~self._over) > 0
             self._draw(np.flatnonzero(self._over).tolist(), out)
-        else:
-            ended = self._batch.step(actions, out) > 0
         over = out.terminated | out.truncated if ended else np.zeros(self.num_envs, np.bool_)
         if self.autoreset_mode == AutoresetMode.SAME_STEP and ended:
             infos = self._finals(out, over)
@@ -424,6 +472,18 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         self._over, self._waiting = over, ended
         infos.update(self._infos(out))
         return self._observations(), out.reward, out.terminated.copy(), out.truncated.copy(), infos
+
+    def _hold(self, actions: Array, out: Out, active: Mask | None) -> bool:
+        """Advance the active slots (None: all) while their episodes last; tell whether one of these ended."""
+        ended = self._batch.step(actions, out, active) > 0
+        summed = [out.reward] if self._cost is None else [out.reward, out.info[self._cost, : self.num_envs]]
+        for _ in range(self.action_repeat - 1):
+            going = ~(out.terminated | out.truncated) & (self._everybody if active is None else active)
+            before = [each.copy() for each in summed]
+            ended |= self._batch.step(actions, out, going) > 0
+            for each, earlier in zip(summed, before, strict=True):
+                each[going] += earlier[going]
+        return ended
 
     def get_state(self) -> tuple[EnvState, ...]:
         """Picklable values, one a slot; :meth:`set_state`, also of the scalar form, continues them bit-exactly.
@@ -475,7 +535,7 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         if seed is None:
             return
         if isinstance(seed, int | np.integer):
-            seed = [int(seed) + i for i in range(self.num_envs)]
+            seed = [int(seed) + (i + 1 << APART) for i in range(self.num_envs)]
         seeds = list(seed)
         if len(seeds) != self.num_envs:
             raise CzError(f"expected {self.num_envs} seeds, one a slot, got {len(seeds)}")
@@ -528,8 +588,7 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
         shown = [rows[row] for row in self._rows]
         infos: dict[str, Any] = dict.fromkeys(self._masks, mask)
         infos.update(zip(self._names, shown if whole else np.where(mask, shown, 0.0), strict=True))
-        if self._everything or clipped.any():
-            infos["action_clipped"], infos["_action_clipped"] = clipped, mask if self._everything else clipped.copy()
+        infos["action_clipped"], infos["_action_clipped"] = clipped, mask
         if self._named:
             scenarios = self._batch.scenarios.copy()
             scenarios[~mask] = None

@@ -65,6 +65,7 @@ class CzVecEnv(VecEnv):
             width = len(observations(env.config.process)["history"]) + len(env.config.process.state)
             space = Box(-np.inf, np.inf, (width,), np.float32)
         self.slots = [Slot(self, i) for i in range(env.num_envs)]
+        self._given: int | Sequence[int | None] | None = None
         super().__init__(env.num_envs, space, env.single_action_space)
         self._actions = np.zeros((env.num_envs, 2), np.float32)
         self._returns = np.zeros(env.num_envs)
@@ -76,10 +77,17 @@ class CzVecEnv(VecEnv):
         if stagger is not None:
             self._cuts = np.random.default_rng(stagger).integers(1, env.config.steps, env.num_envs, endpoint=True)
 
+    def seed(self, seed: int | Sequence[int | None] | None = None) -> Sequence[int | None]:
+        """Seed the next reset as :meth:`cz_gym.CzVectorEnv.reset` does: by one number for the batch, or one a slot."""
+        self._given = int(np.random.randint(0, np.iinfo(np.uint32).max, dtype=np.uint32)) if seed is None else seed
+        return [self._given] * self.num_envs if isinstance(self._given, int | np.integer) else list(self._given)
+
     def reset(self) -> Any:
-        """Draw new episodes, with the seeds and options given before."""
-        observation = self._shown(*self.env.reset(seed=list(self._seeds), options=(self._options or [{}])[0] or None))
-        self._reset_seeds()
+        """Draw new episodes, with the seeds and options given before; options may be a list, one a slot."""
+        own: Any = self._options or [{}]
+        alike = all(each is own[0] for each in own) and not isinstance(own[0].get("state"), EnvState)
+        observation = self._shown(*self.env.reset(seed=self._given, options=own[0] or None if alike else own))
+        self._given = None
         self._reset_options()
         self._returns[:] = self._costs[:] = 0.0
         self._lengths[:] = 0
@@ -181,9 +189,11 @@ class Slot:
         self.reset(options={"state": state})
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # also while a copy is made, which has no attributes yet
+            raise AttributeError(f"a slot has no {name!r}")
         batch, own = self._among.env, {"observation_space", "action_space"}
         value = getattr(self._among if name in own else batch, name)
-        if name.startswith("_") or callable(value):
+        if callable(value):
             raise AttributeError(f"a slot has no {name!r}; its methods are reset, get_state and set_state")
         return value[self._i] if name.startswith("np_random") else value
 
@@ -198,6 +208,9 @@ class ActionRepeat(VecEnvWrapper):
     def __init__(self, venv: VecEnv, times: int) -> None:
         super().__init__(venv)
         self.times = times
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.venv, self.times)  # the wrapper's own state holds what does not pickle
 
     def reset(self) -> Any:
         """Reset every slot."""
@@ -223,5 +236,8 @@ class ActionRepeat(VecEnvWrapper):
 def environment_steps(model: BaseAlgorithm) -> int:
     """Training steps of a model [environment steps]; each repeat of an action counts."""
     env = model.get_env()
-    repeat = None if env is None else unwrap_vec_wrapper(env, ActionRepeat)
-    return int(model.num_timesteps) * (1 if repeat is None else repeat.times)
+    if env is None:
+        return int(model.num_timesteps)
+    repeat = unwrap_vec_wrapper(env, ActionRepeat)
+    own = max(env.get_attr("action_repeat")) if env.has_attr("action_repeat") else 1
+    return int(model.num_timesteps) * own * (1 if repeat is None else repeat.times)

@@ -1,10 +1,12 @@
 """Parts of every figure: the style of each controller, a canvas without a display, PNG bytes."""
 
 import io
+import os
 from collections.abc import Callable, Sequence
 from itertools import cycle
 from typing import Any, NamedTuple
 
+import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -18,6 +20,9 @@ from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
 from .protocol import Contender
 from .rollout import Floats
+
+if "CZ_GYM_COMMAND" in os.environ:  # the reader's matplotlibrc is for the reader's own figures
+    matplotlib.rcdefaults()
 
 COLOURS = (
     "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#4B0055", "#7F5FB0", "#8C6D1F",

@@ -22,6 +22,8 @@ from cz_gym.puller.file import DEFAULT, PullerFile
 from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.units import MM, MM_PER_MIN
 
+from .rollout import check_policy, settings_of
+
 REWARD, STATE, PLANT = "reward", "state", "plant"
 """Sources that an agent learned from: the reward alone; the reward, and the true state, told in training; gradients
 through the plant's equations."""
@@ -348,17 +350,27 @@ class Maker:
         return self.source(**{name: value for name, value in given.items() if name in known})
 
 
-def user_controller(place: str) -> Contender:
+def user_controller(place: str, config: Config | None = None) -> Contender:
     """Return the contender at ``FILE.py:NAME``: an object with ``predict``, or a class or function that makes one.
 
     It is made without arguments, with ``config`` (the environment's settings) or ``control_interval`` [s], whichever it
-    names. Its attributes ``observation`` and ``action`` say what it reads and what its actions mean; "measured" and
-    "direct" without.
+    names. Once made, here for ``config``, its settings say what it reads and what its actions mean
+    (:func:`cz_gym.evaluation.rollout.settings_of`); "measured" and "direct" without.
     """
     source = (maker := Maker.of(place)).source
     if not (hasattr(source, "predict") or (callable(source) and not inspect.isclass(source))):
         raise CzError(f"{place}: no controller: it has no method predict(observation, state, ...)")
-    reads, acts = str(getattr(source, "observation", "measured")), str(getattr(source, "action", "direct"))
+    usual = config or make_config(observation="measured", action="direct")
+    made = maker(usual)
+    if not (hasattr(made, "predict") or hasattr(made, "for_episodes")):
+        raise CzError(f"{place}: no controller: it makes a {type(made).__name__}, which has no method predict")
+    settings = {"observation": "measured", "action": "direct"} | settings_of(made)
+    fitting = replace(usual, observation=settings["observation"], action=settings["action"])
+    try:
+        check_policy(maker(fitting), fitting)
+    except CzError as error:
+        raise CzError(f"{place}: {error}") from None
+    reads, acts = settings["observation"], settings["action"]
     return Contender(place.rpartition(":")[2], maker, reads, f"of {place}", action=acts, own=True)
 
 

@@ -1,20 +1,21 @@
 """Rollouts: a policy on seeded episodes, all in one batch, every signal logged."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from inspect import signature
+from numbers import Real
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium.error import InvalidAction
 
-from cz_gym.config import Config, check_config
+from cz_gym.config import Config, check_config, make_config
 from cz_gym.env import CzVectorEnv
 from cz_gym.spaces import mismatch
-from cz_gym.support.errors import CzError
+from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.units import MICRO
 
 Floats = npt.NDArray[np.float64]
@@ -128,8 +129,8 @@ def check_seeds(seeds: Sequence[int] | npt.NDArray[Any]) -> tuple[int, ...]:
 def check_policy(policy: Any, config: Config, designed_for: Config | None = None) -> None:
     """Raise CzError unless the policy can run in the environment of these settings.
 
-    Its attribute ``made_for``, or without one its attributes ``action`` and ``control_interval``, must fit ``config``,
-    or what it is ``designed_for``; a ``made_for`` of None fits everywhere.
+    Its attribute ``made_for`` and its settings (:func:`settings_of`) must fit ``config``, or what it is
+    ``designed_for``; a ``made_for`` of None fits everywhere.
     """
     check_config(config)
     if isinstance(policy, type) or not (hasattr(policy, "predict") or hasattr(policy, "for_episodes")):
@@ -140,14 +141,53 @@ def check_policy(policy: Any, config: Config, designed_for: Config | None = None
             signature(policy.predict).bind(None, state=None, episode_start=None, deterministic=True)
         except TypeError as error:
             raise CzError(f"{type(policy).__name__}.predict: {error}; it must be {PREDICT}") from None
-    own = (designed_for or config).made_for
-    acts, interval = getattr(policy, "action", None), getattr(policy, "control_interval", None)
-    declared = own._replace(
-        action=acts if isinstance(acts, str) else own.action,
-        control_interval=own.control_interval if interval is None else interval,
-    )
-    if message := mismatch(getattr(policy, "made_for", declared), own):
+    target, declared = designed_for or config, settings_of(policy)
+    own = target.made_for
+    said = {name: declared[name] for name in ("action", "control_interval") if name in declared}
+    made_for = getattr(policy, "made_for", own._replace(**said))
+    if message := mismatch(made_for, own):
         raise CzError(f"{type(policy).__name__}: {message}")
+    if made_for is not None:
+        _check_settings(policy, declared, target)
+
+
+INTERFACE = "observation", "action", "control_interval", "puller", "parameters", "meniscus", "camera", "process"
+"""Settings that a policy depends on; the others say what it meets there."""
+
+
+def settings_of(policy: Any) -> dict[str, Any]:
+    """Arguments of ``gym.make`` that a policy declares by its attribute ``settings``, a mapping, or by its attributes
+    ``observation``, ``action`` and ``control_interval``; CzError where these differ.
+    """
+    settings, name = getattr(policy, "settings", None), type(policy).__name__
+    if settings is not None and not isinstance(settings, Mapping):
+        raise CzError(f"{name}: its settings must be a dict of arguments of gym.make, not {settings!r:.80}")
+    given = dict(settings or {})
+    for each, kind in {"observation": str, "action": str, "control_interval": Real}.items():
+        own = getattr(policy, each, None)
+        if isinstance(own, kind) and given.setdefault(each, own) != own:
+            raise CzError(f"{name}: its {each} is {own!r}, its settings say {given[each]!r}")
+    return given
+
+
+def _check_settings(policy: Any, declared: Mapping[str, Any], target: Config) -> None:
+    """Raise CzError unless an environment has what a policy declares."""
+    known = [*signature(make_config).parameters, *_NO_MATTER, "action_repeat"]
+    for name in declared:
+        if name not in known:
+            raise CzError(f"{type(policy).__name__}: {unknown_name_message('setting', name, known)}")
+    if declared.get("action_repeat", 1) != 1:
+        raise CzError(f"{type(policy).__name__}: it repeats its actions; here a policy acts at every control interval")
+    wanted = make_config(**{name: value for name, value in declared.items() if name in INTERFACE})
+    readable = getattr(policy, "observations", ())
+    for name in INTERFACE:
+        has = getattr(target, name)
+        if name in declared and has != getattr(wanted, name) and not (name == "observation" and has in readable):
+            said = f"was made for {name}={declared[name]!r:.80}; the environment has {has!r:.80}"
+            raise CzError(f"{type(policy).__name__}: this controller or agent {said}")
+
+
+_NO_MATTER = "info", "render_mode", "render_size", "num_envs", "autoreset_mode", "threads"
 
 
 def call_policy(policy: Any, observation: Any, state: Any, begins: Any) -> tuple[Any, Any]:

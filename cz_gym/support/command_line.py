@@ -4,6 +4,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
+from io import TextIOWrapper
 from pathlib import Path
 from typing import NoReturn
 
@@ -74,11 +75,16 @@ def between(least: int, most: int) -> Callable[[str], int]:
 def run_command(prog: str, body: Callable[[], int], extra: str, left: str = "nothing written") -> int:
     """Run a command's body and return its exit code.
 
-    One line on stderr tells of a :class:`CzError`, a missing package of the project's extras, and Ctrl-C; a closed pipe
-    of stdout ends the command quietly; every other exception is a bug, the user's or ours, and keeps its traceback.
+    One line on stderr tells of a :class:`CzError`, a missing package of the project's extras, Ctrl-C, and of an output
+    that cannot be written; a closed pipe of stdout ends the command quietly; every other exception is a bug, the user's
+    or ours, and keeps its traceback. Characters that the terminal's encoding lacks become question marks.
     ``extra`` names the extras of what the command imports, ``left`` says what an interrupt leaves behind.
     """
-    os.environ["MPLBACKEND"] = "agg"  # commands draw files; a notebook's backend may be missing here
+    # Commands draw files: a notebook's backend may be missing here, and a user's matplotlibrc is for other figures.
+    os.environ |= {"MPLBACKEND": "agg", "CZ_GYM_COMMAND": prog}
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         code = body()
         sys.stdout.flush()
@@ -90,13 +96,16 @@ def run_command(prog: str, body: Callable[[], int], extra: str, left: str = "not
         if module not in OPTIONAL:
             raise
         message = missing(module, extra)
-    except BrokenPipeError:
+    except OSError as error:
         try:
-            print(flush=True)  # fails again if it was stdout's pipe, whose reader has seen enough, as head has
-        except BrokenPipeError:
+            print(flush=True)  # fails again if it was stdout
+        except OSError:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 141
-        raise
+            if isinstance(error, BrokenPipeError):  # its reader has seen enough, as head has
+                return 141
+            message = f"the output cannot be written: {error.strerror}"
+        else:
+            raise
     except KeyboardInterrupt:
         print(f"{prog}: interrupted; {left}", file=sys.stderr)
         return 130

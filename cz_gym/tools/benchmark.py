@@ -163,7 +163,8 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
     Those of the user's files always take part, shipped agents by default if no agent is given, slow controllers if
     ``--slow`` asks for them, or if they are named and all their episodes cached.
     """
-    own, given = [user_controller(place) for place in arguments.controller], given_agents(arguments)
+    usual = cases[0].design_config() if cases else None
+    own, given = [user_controller(place, usual) for place in arguments.controller], given_agents(arguments)
     controllers, shipped = TASKS[arguments.env].controllers(), shipped_names(arguments.env)
     known = [*(each.name for each in controllers), *(name for name in given if name not in shipped), *shipped]
     check_apart([*known, *(each.name for each in own)], "controller")
@@ -174,7 +175,7 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
     chosen = [each for each in controllers if each.name in wanted]
     check_quick(chosen, arguments, cases)
     chosen += agents_of(given, shipped, wanted)
-    check_agents(chosen, cases)
+    check_agents([*chosen, *own], cases)
     if not (chosen or own):
         raise CzError("no controller takes part: name some with --controllers")
     return [*chosen, *own]

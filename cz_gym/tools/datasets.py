@@ -32,7 +32,7 @@ from cz_gym.config import Config, check_config, make_config
 from cz_gym.env import CzVectorEnv
 from cz_gym.evaluation.parallel import run_parallel
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
-from cz_gym.evaluation.rollout import informed, rollout
+from cz_gym.evaluation.rollout import informed, rollout, settings_of
 from cz_gym.puller.file import DEFAULT, PullerFile, chosen_puller, to_toml
 from cz_gym.spaces import DRIVE_CHANNELS, drives_of, to_measured
 from cz_gym.support.command_line import OneLineParser, between
@@ -88,7 +88,7 @@ def find_policy(name: str, config: Config) -> Any:
     if name == "mixed":
         return tuple(find_policy(each, config) for each in MIXED)
     try:
-        settings = settings_of(agents.load(name))
+        settings = modes_of(agents.load(name))
     except ValueError as error:
         raise CzError(unknown_name_message("policy", name, [*controllers, *OWN], f"; or an agent: {error}")) from None
     return agents.load(name, replace(config, **settings))
@@ -106,9 +106,9 @@ def reference_scores(config: Config) -> dict[str, float]:
     return {"ref_min_score": means[0], "ref_max_score": max(means)}
 
 
-def settings_of(policy: Any) -> dict[str, Any]:
+def modes_of(policy: Any) -> dict[str, Any]:
     """Environment settings "observation" and "action" of a policy; by default "measured" and "direct"."""
-    settings = {"observation": "measured", "action": "direct"} | getattr(policy, "settings", {})
+    settings = {"observation": "measured", "action": "direct"} | settings_of(policy)
     return {name: settings[name] for name in ("observation", "action")}
 
 
@@ -138,7 +138,7 @@ def record(policy: Any, config: Config, seeds: Sequence[int], noise: float) -> l
         turns = [[seed for seed in seeds if policy[seed % len(policy)] is each] for each in policy]
         parts = [record(each, config, turn, noise) for each, turn in zip(policy, turns, strict=True) if turn]
         return sorted((episode for part in parts for episode in part), key=lambda each: seeds.index(each["seed"]))
-    settings, n, noise = settings_of(policy), len(seeds), highest_noise(policy, noise)
+    settings, n, noise = modes_of(policy), len(seeds), highest_noise(policy, noise)
     policy = informed(policy, config, seeds)
     drives = drives_of(settings["action"], config.control_interval, config.heater_range)
     gains, place = np.array([drives.pull, drives.heater]), list(DRIVE_CHANNELS)

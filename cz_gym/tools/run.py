@@ -128,15 +128,17 @@ def roll_out(
 
 
 def check_agents(contenders: Sequence[Contender], cases: Sequence[Case]) -> None:
-    """Raise CzError for an agent that was trained for another environment than a case has, its control interval say."""
+    """Raise CzError for an agent, or the user's own controller, that was made for another environment than a case has,
+    its control interval say.
+    """
     for each in contenders:
         for case in cases:
-            config = case.design_config(each.observation, each.action)
-            for policy in each.trained:
+            config, kind = case.design_config(each.observation, each.action), "agent" if each.learned else "controller"
+            for policy in each.policies(config) if each.own else each.trained:
                 try:
                     check_policy(policy, config)
                 except CzError as error:
-                    raise CzError(f"agent {each.name!r} on {case.name}: {error}") from None
+                    raise CzError(f"{kind} {each.name!r} on {case.name}: {error}") from None
 
 
 def episodes_of(contender: Contender, case: Case, episodes: int) -> range:

@@ -328,7 +328,7 @@ def test_weight_and_lean_info():
     env = gym.make("CzCrystal-v0", scenario="nominal", observation="measured", action="direct").unwrapped
     env.reset(seed=0)
     observation, *_, info = env.step(np.zeros(2, np.float32))
-    assert info.keys() == {"r_c", "r_ref", "cost", "succeeded"}
+    assert info.keys() == {"r_c", "r_ref", "cost", "succeeded", "action_clipped"}
     seen = decode(observation, *env.config.ranges, env.config.process)
     assert abs(seen.weight) <= 0.5 * 9.81 * signals.WEIGHT_STEP + 1e-4
 

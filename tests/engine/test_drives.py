@@ -81,7 +81,7 @@ def test_the_pyrometer_reads_the_filtered_temperature():
 def test_the_batch_and_saved_states_know_the_slow_drives():
     settings = {"scenario": slow(20.0, 12.0, 15.0), "observation": "measured", "info": "all"}
     batch, envs = CzVectorEnv(3, **settings), [CzEnv(**settings) for _ in range(3)]
-    first = batch.reset(seed=1)[0], np.stack([env.reset(seed=1 + i)[0] for i, env in enumerate(envs)])
+    first = batch.reset(seed=[1, 2, 3])[0], np.stack([env.reset(seed=1 + i)[0] for i, env in enumerate(envs)])
     np.testing.assert_array_equal(*first)
     for k, action in enumerate(np.random.default_rng(0).uniform(-1, 1, (40, 3, 2)).astype(np.float32)):
         if k == 20:

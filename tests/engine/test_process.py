@@ -29,7 +29,7 @@ from cz_gym.process import DONE, GROWS, LOST, PULL_SCALE, Channel, Inputs, Past,
 from cz_gym.tools.report.tables import rows
 from cz_gym.tools.report.task_records import BODY_DRIVES, BODY_ERROR
 from cz_gym.tools.run import run as benchmark
-from tests.vector_checker import check_vector_env
+from cz_gym.vector_checker import check_vector_env
 
 # The process: at most 80 lines to the mark below.
 LEVEL, FALL, MM = Channel("m", 1e-3, "level above reference"), Channel("m/s", PULL_SCALE, "inflow above nominal"), 1e-3

@@ -166,7 +166,7 @@ def test_the_environment_s_own_crystals_and_observations(scenario):
     """Also where the config observes something else."""
     batch, env = DifferentiableBatch(make_config(scenario), 4), CzVectorEnv(4, scenario, observation="measured")
     _, measured = batch.reset([5, 6, 7, 8])
-    first, infos = env.reset(seed=5)
+    first, infos = env.reset(seed=[5, 6, 7, 8])
     np.testing.assert_array_equal(measured, first)
     np.testing.assert_array_equal(batch.scenarios, infos.get("scenario", scenario))
     for action in np.random.default_rng(0).uniform(-0.2, 0.2, (50, 4, 2)):

@@ -8,12 +8,15 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import InvalidAction, ResetNeeded
 
 import cz_gym
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv, Parameters, Scenario, make_puller
 from cz_gym.body.signals import Logged
+from cz_gym.camera import Camera
 from cz_gym.config import Config, make_config
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.engine.batch import first_key
 from cz_gym.engine.tangents import DifferentiableBatch
 from cz_gym.episodes.draw import MIXTURE_STREAM
@@ -21,6 +24,7 @@ from cz_gym.episodes.scenario import Actuators
 from cz_gym.episodes.scenarios import ALL, find_distribution
 from cz_gym.physics.plant import Disturbance, State, growth
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
+from cz_gym.puller.file import FOLDER, find_puller
 from cz_gym.spaces import tag
 from tests.observed import PLAIN
 
@@ -61,7 +65,7 @@ def test_everything_advertised_is_there():
         ({"render_mode": "hologram"}, "render_mode .*'hologram'"),
         ({"parameters": {"sigma": 1.0}}, r"cz_gym\.Parameters"),
         ({"parameters": Parameters(k_l=math.nan)}, "parameter k_l = nan"),
-        ({"meniscus": "hurle"}, r"cz_gym\.MeniscusModel"),
+        ({"meniscus": "hurl"}, r"cz_gym\.MeniscusModel"),
         ({"process": "x"}, "this needs a Process, not 'x': cz_gym.body.process.BODY is one"),
         ({"scenaro": "hard"}, "unexpected keyword argument .scenaro.: did you mean .scenario.[?]"),
         ({"frameskip": 4}, "unexpected keyword argument .frameskip.; choose from scenario"),
@@ -213,7 +217,7 @@ def test_rates_add_up_within_the_range_of_the_drives(interval):
 
 def test_info_is_lean_unless_all_is_asked_for():
     for env, keys in (
-        (CzEnv(), {"r_c", "r_ref", "cost"}),
+        (CzEnv(), {"r_c", "r_ref", "cost", "action_clipped"}),
         (CzEnv(info="all"), {*Logged._fields, "state"}),
         (CzEnv(info="all", observation="measured"), set(Logged._fields)),
     ):
@@ -221,8 +225,9 @@ def test_info_is_lean_unless_all_is_asked_for():
         assert set(info) == keys
         *_, info = env.step(np.array([0.5, 0.5], np.float32))
         assert set(info) == keys
+        assert not info["action_clipped"]
         *_, info = env.step(np.array([1.5, 0.5], np.float32))
-        assert set(info) == keys | {"action_clipped"}
+        assert (set(info), type(info)) == (keys, dict), "trees of arrays take no other keys and no other class"
         assert info["action_clipped"]
         assert {type(value) for value in info.values()} <= {np.float64, np.bool_, bool, np.ndarray}, (
             "TorchRL reads dtypes"
@@ -270,7 +275,7 @@ def test_shares_order_and_unit_of_equal_mixtures_do_not_matter():
 
 
 def test_shares_of_two_thousand_episodes_on_a_stream_of_their_own():
-    _, infos = CzVectorEnv(2000, "all").reset(seed=5)
+    _, infos = CzVectorEnv(2000, "all").reset(seed=list(range(5, 2005)))
     names, upto = [each.name for each in ALL.scenarios], np.cumsum(ALL.shares)
     for i in range(2000):
         stream = np.random.SeedSequence(list(first_key(5 + i)), spawn_key=(MIXTURE_STREAM,))
@@ -347,3 +352,47 @@ def test_step_refuses_what_was_made_for_another_environment(step, other, named):
     take(np.clip(2.0 * theirs, -1.0, 1.0))
     take(tag(action, make_config("hard", **PLAIN).made_for))
     take(tag(action, None))
+
+
+SPECS = [
+    ("Cz-v0", {"scenario": replace(SCENARIOS["puller"], name="mine"), "control_interval": np.int64(10)}),
+    ("Cz-v0", {"scenario": {replace(SCENARIOS["hard"], name="mine"): 1, "puller": np.float32(2.0)}}),
+    ("Cz-v0", {"scenario": ALL, "model": np.float64(0.5), "weights": {"pull": 0.1}, "action_repeat": 4}),
+    ("Cz-v0", {"parameters": Parameters(T_m=1686.0), "meniscus": YOUNG_LAPLACE}),
+    ("Cz-v0", {"observation": "camera", "camera": Camera(tilt=0.4)}),
+    ("Cz-v0", {"puller": find_puller("germanium")}),
+    ("Cz-v0", {"puller": FOLDER / "germanium.toml", "process": CRYSTAL}),
+    ("CzCrystal-v0", {"stage": {"crown": 1, "tail": np.float64(2.0)}}),
+    ("CzCrystal-v0", {"parameters": make_config(process=CRYSTAL, stage="tail").parameters}),
+]
+
+
+@pytest.mark.parametrize(("name", "arguments"), SPECS)
+def test_a_spec_is_json_that_makes_the_same_environment(name, arguments):
+    for make, given in ((gym.make, {}), (gym.make_vec, {"num_envs": 2, "vectorization_mode": "vector_entry_point"})):
+        env = make(name, **given, **arguments)
+        again = make(EnvSpec.from_json(env.spec.to_json()), **given)
+        for one, other in ((again, env), (deepcopy(env), env), (pickle.loads(pickle.dumps(env)), env)):
+            assert one.unwrapped.config == other.unwrapped.config
+            assert one.unwrapped.action_repeat == arguments.get("action_repeat", 1)
+
+
+@pytest.mark.parametrize("steps", [50, 6])
+def test_a_repeated_action_is_the_same_action_for_some_steps(steps):
+    """Reward and cost are sums; episodes of 6 steps end in the middle of the second action."""
+    settings = {"scenario": "hard", "action": "direct", "horizon": 5.0 * steps}
+    repeated, plain = CzEnv(**settings, action_repeat=4), CzEnv(**settings)
+    for env in (repeated, plain):
+        env.reset(seed=5)
+    for action in np.random.default_rng(0).normal(0.0, 0.3, (2, 2)).astype(np.float32):
+        observation, reward, terminated, truncated, info = repeated.step(action)
+        singly = []
+        while len(singly) < 4 and not any(singly[-1][2:4] if singly else ()):
+            singly.append(plain.step(action))
+        np.testing.assert_array_equal(observation, singly[-1][0])
+        assert (reward, terminated, truncated) == (sum(each[1] for each in singly), *singly[-1][2:4])
+        assert info["cost"] == sum(each[4]["cost"] for each in singly)
+        assert info["r_c"] == singly[-1][4]["r_c"]
+    assert truncated == (steps == 6)
+    with pytest.raises(ValueError, match="action_repeat must be a positive whole number, not 0"):
+        CzEnv(action_repeat=0)

@@ -1,5 +1,8 @@
 """The adapter under stable-baselines3's wrappers, against a vector of scalar environments."""
 
+import copy
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -13,7 +16,7 @@ from cz_gym import CzEnv, CzVectorEnv
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.asymmetric import AsymmetricPolicy, AsymmetricSACPolicy, LearnState
 from cz_gym.agents.from_sb3 import save_agent
-from cz_gym.sb3 import make_vec_env
+from cz_gym.sb3 import environment_steps, make_vec_env
 from cz_gym.support.errors import CzError
 
 N = 3
@@ -27,8 +30,7 @@ def adapter(n=N, stagger=None, **changes):
 def test_the_adapter_equals_sb3s_own_vector_of_scalars():
     ours, theirs = adapter(), DummyVecEnv([lambda: CzEnv(**SETTINGS)] * N)
     rng = np.random.default_rng(0)
-    for env in (ours, theirs):
-        env.seed(5)
+    ours.seed(theirs.seed(5))
     np.testing.assert_array_equal(ours.reset(), theirs.reset())
     failed = truncated = 0
     costs, sums = np.zeros(N), []
@@ -111,11 +113,11 @@ def test_methods_and_attributes_reach_the_slots_that_are_named_as_in_sb3s_own_ve
         np.testing.assert_equal(one, other)
         return one
 
-    both(lambda env: env.seed(5))
+    ours.seed(theirs.seed(5))
     both(lambda env: env.reset())
     both(lambda env: env.step(action)[:3])
     ((seen, info),) = both(lambda env: env.env_method("reset", seed=8, indices=[1]))
-    assert (seen.shape, set(info)) == ((73,), {"r_c", "r_ref", "cost"})
+    assert (seen.shape, set(info)) == ((73,), {"r_c", "r_ref", "cost", "action_clipped"})
     both(lambda env: env.env_method("reset", options={"scenario": "nominal"}, indices=2))
     assert len(both(lambda env: env.env_method("reset"))) == N
     saved = ours.env_method("get_state", indices=[0])
@@ -226,3 +228,60 @@ def test_the_environment_is_named():
     env.close()
     with pytest.raises(CzError, match="unknown environment 'CzCrystal': did you mean 'CzCrystal-v0'"):
         make_vec_env(2, env="CzCrystal")
+
+
+COPIES = {"copy": copy.copy, "deepcopy": copy.deepcopy, "pickle": lambda each: pickle.loads(pickle.dumps(each))}
+"""A shallow copy shares what is inside."""
+
+
+@pytest.mark.parametrize("way", COPIES)
+def test_a_copy_goes_on_as_its_original(way):
+    """Python's copies ask an object for attributes before it has any."""
+    for original in (
+        adapter(), adapter(action_repeat=2), VecNormalize(adapter(), norm_obs=False),
+        make_vec_env(2, env="CzCrystal-v0", stage="tail", critic_state=True),
+    ):  # fmt: skip
+        original.seed(3)
+        original.reset()
+        other = COPIES[way](original)
+        if isinstance(original, VecNormalize):
+            other = VecNormalize(COPIES[way](original.venv), norm_obs=False)
+        if way != "copy":
+            action = np.full((original.num_envs, 2), 0.1, np.float32)
+            np.testing.assert_array_equal(original.step(action)[0], other.step(action)[0])
+        else:
+            assert other.num_envs == original.num_envs
+
+
+def test_options_may_be_given_one_a_slot():
+    ours, theirs = adapter(), DummyVecEnv([lambda: CzEnv(**SETTINGS)] * N)
+    theirs.reset()
+    (state,) = theirs.env_method("get_state", indices=[1])
+    every = {"scenario": "nominal"}
+    for options in (every, {"state": state}, [every, {}, {"state": state}], [{"scenario": {"hard": 1.0}}, {}, {}]):
+        for _ in range(2):
+            ours.seed(theirs.seed(5))
+            for env in (ours, theirs):
+                env.set_options(options)
+            np.testing.assert_array_equal(ours.reset(), theirs.reset())
+        np.testing.assert_array_equal(ours.reset(), theirs.reset())
+    with pytest.raises(CzError, match="expected options for 3 slots, got 2"):
+        ours.env.reset(options=[{}, {}])
+    with pytest.raises(CzError, match="unknown reset option 'seed'"):
+        ours.env.reset(options=[{}, {}, {"seed": 3}])
+
+
+def test_one_seed_of_the_batch_is_no_slot_s_own():
+    env = adapter()
+    assert env.seed(7) == [7] * N
+    first = env.reset()
+    np.testing.assert_array_equal(first, env.env.reset(seed=7)[0])
+    assert not np.array_equal(env.reset(), first)
+    env.seed()
+    assert not np.array_equal(env.reset(), first)
+
+
+def test_steps_of_an_environment_that_repeats_actions_are_counted():
+    model = PPO("MlpPolicy", DummyVecEnv([lambda: CzEnv(**SETTINGS, action_repeat=4)]), n_steps=8, batch_size=8,
+                device="cpu")  # fmt: skip
+    assert environment_steps(model.learn(8)) == 32

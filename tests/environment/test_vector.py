@@ -17,8 +17,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.spaces import OBSERVATIONS
-from tests.vector_checker import NotConforming, check_vector_env
+from cz_gym.vector_checker import NotConforming, check_vector_env
 
 SHORT = {"control_interval": 60.0, "horizon": 1200.0}
 
@@ -49,8 +50,9 @@ def test_the_checkers_of_gymnasium_and_stable_baselines3_on_every_scenario(obser
         {"scenario": "sensor-fault", "observation": "measured"},
         {"scenario": "all", "observation": "history", "action": "smooth", "horizon": 1800.0},
         {"scenario": {"randomized": 1.0, "puller": 1.0}, "info": "lean"},
+        {"scenario": "hard", "action_repeat": 3, "action": "direct", "info": "lean"},
     ],
-    ids=["puller", "hard", "sensor-fault", "all", "lean"],
+    ids=["puller", "hard", "sensor-fault", "all", "lean", "repeat"],
 )
 def test_the_native_batch_is_a_vector_of_scalars(settings, mode):
     settings = {"info": "all", **SHORT, **settings}
@@ -104,8 +106,8 @@ def test_a_thread_that_is_late_is_not_waited_for():
 def test_a_large_batch_holds_the_same_slots_as_a_small_one(rng):
     """Two slots with violent actions, one with small ones: episodes end by failure and by time."""
     large, small = CzVectorEnv(600, horizon=300.0), CzVectorEnv(3, horizon=300.0)
-    first = large.reset(seed=100)[0][500:503]
-    np.testing.assert_array_equal(first, small.reset(seed=600)[0])
+    first = large.reset(seed=list(range(100, 700)))[0][500:503]
+    np.testing.assert_array_equal(first, small.reset(seed=[600, 601, 602])[0])
     noise = rng.uniform(-0.4, 0.4, (70, 3, 2)) + np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 0.0]])
     for action in noise.astype(np.float32):
         wide = np.zeros((600, 2), np.float32)
@@ -182,8 +184,22 @@ def test_what_a_batch_cannot_mean_is_refused(call, error, says):
 
 def test_seeds_are_one_a_slot_and_remembered():
     env = CzVectorEnv(2)
-    env.reset(seed=4)
+    env.reset(seed=[4, 5])
     assert env.np_random_seed == (4, 5)
+
+
+def test_a_single_seed_s_crystals_are_none_of_any_split_s():
+    """Slots of a training seed near the first validation seed meet no crystal of validation or test."""
+    batch, seed = CzVectorEnv(3), VALIDATION_SEEDS[0] - 1
+    first, _ = batch.reset(seed=seed)
+    assert all(each >= 2**128 for each in batch.np_random_seed)
+    for own, shown in zip(batch.np_random_seed, first, strict=True):
+        np.testing.assert_array_equal(CzEnv().reset(seed=own)[0], shown)
+    listed, _ = batch.reset(seed=[seed, seed + 1, seed + 2])
+    assert not (first[:, None] == listed[None]).all(axis=-1).any()
+    assert not (first == batch.reset(seed=seed + 1)[0]).all(axis=-1).any()
+    again, _ = batch.reset(seed=seed)
+    np.testing.assert_array_equal(again, first)
 
 
 NEXT, SAME, DISABLED = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
@@ -275,6 +291,27 @@ BROKEN: dict[str, tuple[dict[str, Any], AutoresetMode]] = {
     "reset of ended slots": ({"reset": lambda *_: {"options": None}}, DISABLED),
 }  # fmt: skip
 """Changes of the vector by what is said of them, and the mode that shows them."""
+
+
+def test_vectors_of_others_pass_or_fail_for_good_reasons():
+    """Gymnasium's vector of CartPoles conforms; its native one takes no seeds for its slots, which share a stream."""
+
+    def cart_pole():
+        return gym.make("CartPole-v1")
+
+    assert check_vector_env(lambda n, mode: SyncVectorEnv([cart_pole] * n, autoreset_mode=mode), cart_pole).failures > 9
+    with pytest.raises(NotConforming, match=r"^\[NextStep\] reset\(seed=\[21, 14, 7\]\) raises Error: Seed must be a"):
+        check_vector_env(lambda n, _: gym.make_vec("CartPole-v1", n, "vector_entry_point"), cart_pole)
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_infos_and_rounding_may_be_left_out_of_a_comparison(mode):
+    def rounded(o, r, ended, late, infos):
+        return o, r * (1.0 + 1e-9), ended, late, {**infos, "more": np.zeros(3)}
+
+    with pytest.raises(NotConforming, match="reward of slot"):
+        check_vector_env(lambda n, mode: vector(n, mode, step=rounded), Walk, steps=40, mode=mode)
+    check_vector_env(lambda n, mode: vector(n, mode, step=rounded), Walk, steps=40, mode=mode, infos=False, rtol=1e-6)
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)

@@ -16,6 +16,7 @@ from cz_gym.body.signals import Logged, Measured
 from cz_gym.camera import Camera
 from cz_gym.config import make_config
 from cz_gym.evaluation import plot
+from cz_gym.evaluation.protocol import user_controller
 from cz_gym.evaluation.rollout import Playback, check_seeds, replay, rollout
 from cz_gym.physics.parameters import Parameters
 from cz_gym.support.errors import CzError
@@ -256,3 +257,95 @@ TAKEOVERS += [({"at": at}, "must lie in the episode") for at in (-1.0, 601.0, fl
 def test_what_cannot_be_rolled_out_is_refused(call, error, message):
     with pytest.raises(error, match=message):
         call()
+
+
+SETTINGS = """
+from types import SimpleNamespace
+import numpy as np
+
+class Base:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        assert observation.shape[1] == 73
+        return np.zeros((len(observation), 2), np.float32), state
+
+class OfClass(Base):
+    settings = {"observation": "history", "action": "smooth"}
+
+class OfInstance(Base):
+    def __init__(self, config):
+        self.settings = {"observation": "history", "action": "smooth", "control_interval": 5.0}
+
+class Attributes(Base):
+    observation, action = "history", "smooth"
+
+def factory(config):
+    return OfInstance(config)
+
+made = OfClass()
+
+class Slow(Base):
+    settings = {"observation": "history", "control_interval": 10.0}
+
+class Germanium(Base):
+    settings = {"observation": "history", "puller": "germanium"}
+
+class Unsure(Base):
+    observation, settings = "measured", {"observation": "history"}
+
+class Typo(Base):
+    settings = {"observations": "history"}
+
+class Repeats(Base):
+    settings = {"observation": "history", "action_repeat": 4}
+
+class State(Base):
+    settings = {"observation": "state"}
+
+def nothing():
+    return SimpleNamespace()
+"""
+
+
+@pytest.fixture
+def own(tmp_path):
+    (tmp_path / "own.py").write_text(SETTINGS)
+    return lambda name: f"{tmp_path / 'own.py'}:{name}"
+
+
+@pytest.mark.parametrize("name", ["OfClass", "OfInstance", "Attributes", "factory", "made"])
+def test_settings_say_what_a_controller_reads_wherever_they_stand(own, name):
+    """They were read from two attributes of the class alone, and another observation was shown without a word."""
+    contender = user_controller(own(name))
+    assert (contender.observation, contender.action, contender.bound) == ("history", "smooth", False)
+    config = make_config(horizon=60.0, observation="history", action="smooth")
+    assert not rollout(contender.make(config), config, [1]).failed.any()
+    for other in ({"observation": "measured"}, {"action": "direct"}):
+        changed = replace(config, **other)
+        with pytest.raises(CzError, match=r"was made for .*; the environment has "):
+            rollout(contender.make(changed), changed, [1])
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("Slow", r"own\.py:Slow: Slow: this .* was made for .*control_interval=10.*; the environment has .*=5"),
+        ("Germanium", "was made for puller='germanium'; the environment has PullerFile"),
+        ("Unsure", "its observation is 'measured', its settings say 'history'"),
+        ("Typo", "unknown setting 'observations': did you mean 'observation'"),
+        ("Repeats", "repeats its actions"),
+        ("nothing", "it makes a SimpleNamespace, which has no method predict"),
+    ],
+)
+def test_settings_that_the_benchmark_has_not_are_refused(own, name, says):
+    with pytest.raises(CzError, match=says):
+        user_controller(own(name))
+
+
+def test_who_declares_the_state_is_a_bound(own):
+    assert user_controller(own("State")).bound
+
+
+def test_controllers_of_measured_readings_read_them_in_history_too():
+    config = make_config(horizon=60.0, action="direct")
+    assert config.observation == "history"
+    assert not rollout(make_controller("paper", config), config, [1]).failed.any()

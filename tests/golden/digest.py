@@ -15,7 +15,7 @@ def digest() -> str:
         env = CzVectorEnv(
             3, scenario, observation="history", control_interval=20.0, horizon=600.0, info="all", action="direct"
         )
-        observation, infos = env.reset(seed=4)
+        observation, infos = env.reset(seed=[4, 5, 6])
         rng = np.random.default_rng(0)
         for _ in range(70):
             found.update(observation.tobytes() + b"".join(np.asarray(infos[name]).tobytes() for name in sorted(infos)))

@@ -219,7 +219,7 @@ STEPS = """
 import gymnasium as gym, numpy as np, cz_gym
 one = gym.make("Cz-v0", scenario="puller", observation="measured")
 two = cz_gym.CzVectorEnv(2, scenario="puller", observation="measured")
-shown = one.reset(seed=1)[0], two.reset(seed=1)[0][0]
+shown = one.reset(seed=1)[0], two.reset(seed=[1, 2])[0][0]
 for _ in range(3):
     shown = one.step(np.zeros(2))[0], two.step(np.zeros((2, 2)))[0][0]
 assert (shown[0] == shown[1]).all()

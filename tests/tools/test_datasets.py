@@ -11,7 +11,7 @@ from cz_gym.evaluation.rollout import Playback, rollout
 from cz_gym.puller.file import DEFAULT, find_puller
 from cz_gym.spaces import DRIVE_CHANNELS
 from cz_gym.tools import datasets
-from cz_gym.tools.datasets import dataset_id, excitation, find_policy, main, record, settings_of, write
+from cz_gym.tools.datasets import dataset_id, excitation, find_policy, main, modes_of, record, write
 
 CONFIG = make_config("randomized", action="direct", horizon=1200.0)
 
@@ -120,7 +120,7 @@ def test_a_lost_crystal_ends_its_episode(place):
 def test_without_excitation_a_policy_acts_as_in_the_benchmark(name):
     """Observations and actions are "measured" and "direct", "measured" and "rate", "history" and "smooth"."""
     policy, seeds = find_policy(name, CONFIG), TRAINING_SEEDS[:3]
-    own = make_config("randomized", horizon=CONFIG.horizon, **settings_of(policy))
+    own = make_config("randomized", horizon=CONFIG.horizon, **modes_of(policy))
     expected = rollout(policy, own, seeds).signals.r_c
     found = np.stack([each["infos"]["r_c"][1:] for each in record(policy, CONFIG, seeds, 0.0)], axis=1)
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-7)  # 0.2 um

@@ -187,7 +187,10 @@ def make_block(name: str, config: Config) -> Block:
         f"Fallback: PID searched for this puller with the drives and the camera of scenario {config.scenario.name}: "
         "gain margin {:.3g}, phase margin {:.3g} deg on Models I and II with a latency of {:g} s.".format(*margins)
     )
-    identifier = identifier_of(Path(name.removesuffix(".onnx")).name)
+    # Blocks of one program need names of their own: a block for another puller or scenario is called by it.
+    machine = config.puller.name if config.puller != DEFAULT else ""
+    scenario = config.scenario.name if config.scenario.name != "puller" else ""
+    identifier = identifier_of("-".join(filter(None, (Path(name.removesuffix(".onnx")).name, machine, scenario))))
     if name == FALLBACK:
         return Block(identifier, pid, pid, config, (takes_over, plant))
     if name in known:

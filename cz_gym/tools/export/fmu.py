@@ -4,6 +4,7 @@ A step is one control interval or several. The unit begins and ends as :class:`c
 has ended, its outputs stay.
 """
 
+import hashlib
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +17,7 @@ from pythonfmu.builder import FmuBuilder
 from cz_gym.body.signals import Measured
 from cz_gym.config import Config, make_config
 from cz_gym.env import CzEnv
-from cz_gym.puller.file import PullerFile, write_puller
+from cz_gym.puller.file import PullerFile, to_toml, write_puller
 from cz_gym.spaces import decode
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
@@ -130,10 +131,13 @@ class CzPuller(Fmi2Slave):  # type: ignore[misc]
 def build_fmu(folder: Path, scenario: str, puller: PullerFile | None = None) -> Path:
     """Write ``CzPuller.fmu`` into the folder, with these defaults of its parameters; returns its path."""
     with TemporaryDirectory() as name:
-        script, file = Path(name) / "cz_puller.py", Path(name) / "puller.toml"
+        file = Path(name) / "puller.toml"
         if puller is not None:
             write_puller(puller, file)
-        script.write_text(SCRIPT.format(scenario=scenario, puller=file.name if puller else ""))
+        text = SCRIPT.format(scenario=scenario, puller=file.name if puller else "")
+        # Python keeps one module of a name: units of one process need names of their own.
+        own = hashlib.sha256((text + (to_toml(puller) if puller else "")).encode()).hexdigest()[:12]
+        (script := Path(name) / f"cz_puller_{own}.py").write_text(text)
         try:
             path: Path = FmuBuilder.build_FMU(script, folder, [file] if puller else [])
         finally:

@@ -44,7 +44,13 @@ def commands() -> OneLineParser:
     add("--watchdog", type=between(5, 86_400), default=60, metavar="S",
         help="time of the crystal after which setpoints that are not renewed give way [s] (%(default)s)")  # fmt: skip
     add("--host", default="127.0.0.1", help="address to listen on (%(default)s); others need --operator")
-    add("--port", type=between(0, 65_535), default=4840, metavar="N", help="port of the OPC UA server (%(default)s)")
+    add(
+        "--port",
+        type=between(0, 65_535),
+        default=4840,
+        metavar="N",
+        help="port of the OPC UA server (%(default)s); 0: a free one, which it prints",
+    )
     add("--page-port", type=between(0, 65_535), default=8080, metavar="N",
         help="port of the operator's page (%(default)s); 0: no page")  # fmt: skip
     add("--operator", metavar="NAME", help="user who may write")

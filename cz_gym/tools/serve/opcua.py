@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from io import BytesIO
 from ipaddress import ip_address
 from pathlib import Path
-from socket import gethostname
+from socket import AF_INET, AF_INET6, gethostname, socket
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
@@ -22,6 +22,10 @@ from asyncua.crypto.cert_gen import setup_self_signed_certificate
 from asyncua.crypto.permission_rules import User, UserRole
 from asyncua.server.address_space import AttributeService
 from asyncua.server.user_managers import UserManager
+from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric.rsa import RSAPrivateKey
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID
 from plotly.offline import get_plotlyjs
 
@@ -148,13 +152,24 @@ class Writes(AttributeService):  # type: ignore[misc]
         return int(ua.StatusCodes.BadTypeMismatch) if bad else 0
 
 
+def free_port(host: str) -> int:
+    """A free port of an address; CzError if it is none of this machine."""
+    try:
+        with socket(AF_INET6 if ":" in host else AF_INET) as place:
+            place.bind((host, 0))
+            port: int = place.getsockname()[1]
+            return port
+    except OSError as error:
+        raise CzError(f"{host}: {error.strerror or error}") from None
+
+
 class Tags:
     """The server with the machine's tags; :meth:`publish` shows new values."""
 
     def __init__(self, machine: Machine, access: AccessControl, host: str, certificates: Path, port: int) -> None:
         self.machine, self.access, self.certificates = machine, access, certificates
         self.server = Server(user_manager=access)
-        self.endpoint = f"opc.tcp://{in_address(host)}:{port}/"
+        self.endpoint = f"opc.tcp://{in_address(host)}:{port or free_port(host)}/"
         self.nodes: dict[str, ua.NodeId] = {}
 
     async def __aenter__(self) -> "Tags":
@@ -227,11 +242,15 @@ def in_address(host: str) -> str:
 
 
 async def certify(folder: Path) -> None:
-    """Make ``certificate.pem`` and ``key.pem`` in a folder that has neither; CzError if it has only one."""
+    """Make ``certificate.pem`` and ``key.pem`` in a folder that has neither.
+
+    CzError if it has only one, or if these cannot serve: expired, locked, not a pair, or not of RSA.
+    """
     certificate, key = folder / "certificate.pem", folder / "key.pem"
     if certificate.is_file() != key.is_file():
         raise CzError(f"{folder} must hold both certificate.pem and key.pem, or neither")
     if certificate.is_file():
+        check_pair(certificate, key)
         return
     mask = os.umask(0o077)
     try:
@@ -244,6 +263,32 @@ async def certify(folder: Path) -> None:
         der.unlink()
     finally:
         os.umask(mask)
+
+
+def check_pair(certificate: Path, key: Path) -> None:
+    """Raise CzError unless a certificate is valid now, and this is its key, of RSA, without a password."""
+    with name_file_in_errors(certificate):
+        shown = certificate.read_bytes()
+    with name_file_in_errors(key):
+        hidden = key.read_bytes()
+    try:
+        public = x509.load_pem_x509_certificate(shown)
+    except ValueError:
+        raise CzError(f"{certificate}: not a certificate in PEM") from None
+    try:
+        private = load_pem_private_key(hidden, None)
+    except TypeError:
+        raise CzError(f"{key}: locked by a password, which this server cannot ask for") from None
+    except (ValueError, UnsupportedAlgorithm):
+        raise CzError(f"{key}: not a private key in PEM") from None
+    if private.public_key() != public.public_key():
+        raise CzError(f"{key} is not the key of {certificate}")
+    if not isinstance(private, RSAPrivateKey):
+        raise CzError(f"{key}: OPC UA's Basic256Sha256 needs a key of RSA")
+    now, first, last = datetime.now(UTC), public.not_valid_before_utc, public.not_valid_after_utc
+    if not first <= now <= last:
+        said = f"expired on {last:%Y-%m-%d}" if now > last else f"is not valid before {first:%Y-%m-%d}"
+        raise CzError(f"{certificate} {said}: without both files new ones are made")
 
 
 def password(role: str) -> str:

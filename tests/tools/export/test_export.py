@@ -611,7 +611,7 @@ def network_with(layer):
 
 def test_a_puller_file_gives_nominal_values_limits_and_its_name(tmp_path):
     assert main(["paper-tuned", "--to", "c", "--out", str(tmp_path), "--puller", "silicon-300mm"]) == 0
-    source, header = ((tmp_path / f"cz_paper_tuned.{end}").read_text() for end in "ch")
+    source, header = ((tmp_path / f"cz_paper_tuned_silicon_300mm.{end}").read_text() for end in "ch")
     config = config_of("puller", puller="silicon-300mm")
     assert config.puller.label in header
     assert f"nominal_radius_mm = {config.parameters.r_0 * 1e3!r}" in source
@@ -643,3 +643,23 @@ def test_the_structured_text_is_of_the_standard(name):
     (loop,) = (each for each in block.body.statements if type(each).__name__ == "ForStatement")
     (sample,) = loop.statements.statements
     assert len(sample.statements.statements) > 100
+
+
+@needs_compiler
+def test_blocks_for_two_pullers_and_scenarios_stand_in_one_program(tmp_path):
+    """One controller: every public symbol of C, and the function block's name, is the block's own."""
+    configs = [config_of("puller"), config_of("hard"), config_of("puller", puller="germanium")]
+    blocks = [make_block("paper", config) for config in configs]
+    texts = [write_st(block.program) for block in blocks]
+    assert len({re.search(r"FUNCTION_BLOCK (\w+)", text)[1].lower() for each in texts for text in each.values()}) == 3
+    assert [block.name for block in blocks] == ["paper", "paper_hard", "paper_germanium"]
+    main = "".join(f'#include "cz_{block.name}.h"\n' for block in blocks) + "int main(void) {\n"
+    for block in blocks:
+        for file, text in write_c(block.program).items():
+            (tmp_path / file).write_text(text)
+        main += f"static cz_{block.name} {block.name}; cz_{block.name}_init(&{block.name});\n"
+    (tmp_path / "main.c").write_text(main + "return 0; }\n")
+    sources = ["main.c", *(f"cz_{block.name}.c" for block in blocks)]
+    command = ["gcc", "-std=c99", "-Wall", "-Wextra", "-Werror", *sources, "-lm", "-o", "program"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    assert subprocess.run([tmp_path / "program"]).returncode == 0

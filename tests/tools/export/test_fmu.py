@@ -92,3 +92,27 @@ def test_a_folder_with_a_space_holds_a_unit(unit, tmp_path):
     """FMPy #230: pythonfmu reads spaces in paths; what it does not read is on the page."""
     folder = fmpy.extract(unit, str(tmp_path / "a unit"))
     assert len(fmpy.simulate_fmu(folder, stop_time=10.0)) == 3
+
+
+def test_units_of_one_process_are_each_its_own(tmp_path):
+    """PythonFMU #97: Python keeps one module of a name, so the second unit was silently the first."""
+    own = {
+        "nominal": ("--scenario", "nominal"),
+        "ramp": ("--scenario", "paper-ramp"),
+        "germanium": ("--puller", "germanium", "--scenario", "nominal"),
+    }
+    for name, options in own.items():
+        assert main(["--plant", "--to", "fmu", "--out", str(tmp_path / name), *options]) == 0
+    code = (
+        "import sys, fmpy\nfor file in sys.argv[1:]:\n"
+        "    print(fmpy.simulate_fmu(file + '/CzPuller.fmu', stop_time=1200, output=['T_1_ref_K'])[-1][1])"
+    )
+
+    def ends(names):
+        run = subprocess.run([sys.executable, "-c", code, *names], cwd=tmp_path, capture_output=True, text=True)
+        return [float(line) for line in run.stdout.split()]
+
+    alone = {name: ends([name]) for name in own}
+    assert len({end for (end,) in alone.values()}) == 3
+    assert ends(own) == [end for (end,) in alone.values()]
+    assert ends(reversed(own)) == [end for (end,) in reversed(alone.values())]

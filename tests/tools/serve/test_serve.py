@@ -11,14 +11,20 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
+from cz_gym.support.errors import CzError
 from cz_gym.tools.export.block import SETPOINT_NAMES
 from cz_gym.tools.identify.log import read_log
 from cz_gym.tools.serve import command
+from cz_gym.tools.serve.opcua import certify
 from tests.conftest import ROOT
 from tests.tools.serve.conftest import PASSWORD, answer, connected, free_port, running, with_client
 
@@ -315,3 +321,51 @@ def test_a_port_that_is_taken_and_half_a_certificate_are_said_in_one_line(puller
     for place in (tmp_path / "key.pem", Path("/proc/none")):
         assert str(place) in refused(command.main, [*options[:-1], str(place)])
     assert "--log-size divides" in refused(command.main, ["--log-size", "5"])
+
+
+def pair(folder, days=(-1, 1), kind="rsa", secret=None, other=False):
+    """A certificate and a key in a folder, as openssl would make them."""
+    make = {"rsa": lambda: rsa.generate_private_key(65537, 2048), "ec": lambda: ec.generate_private_key(ec.SECP256R1())}
+    own, now = make[kind](), datetime.now(UTC)
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "a")])
+    builder = x509.CertificateBuilder(name, name, own.public_key(), 7)
+    first, last = (now + timedelta(days=day) for day in days)
+    signed = builder.not_valid_before(first).not_valid_after(last).sign(own, hashes.SHA256())
+    (folder / "certificate.pem").write_bytes(signed.public_bytes(serialization.Encoding.PEM))
+    lock = serialization.BestAvailableEncryption(secret) if secret else serialization.NoEncryption()
+    form = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, lock
+    (folder / "key.pem").write_bytes((make[kind]() if other else own).private_bytes(*form))
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"days": (-9, -2)}, r"certificate\.pem expired on \d{4}-\d\d-\d\d"),
+        ({"days": (2, 9)}, r"certificate\.pem is not valid before"),
+        ({"other": True}, r"key\.pem is not the key of .*certificate\.pem"),
+        ({"secret": b"secret"}, r"key\.pem: locked by a password"),
+        ({"kind": "ec"}, r"key\.pem: OPC UA's Basic256Sha256 needs a key of RSA"),
+    ],
+)
+def test_a_certificate_that_no_client_could_trust_is_refused(tmp_path, given, says):
+    pair(tmp_path)
+    asyncio.run(certify(tmp_path))
+    pair(tmp_path, **given)
+    with pytest.raises(CzError, match=says) as caught:
+        asyncio.run(certify(tmp_path))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["certificate.pem", "key.pem"])
+def test_a_file_that_is_no_certificate_is_refused(tmp_path, name):
+    pair(tmp_path)
+    (tmp_path / name).write_bytes(b"\x00\x01")
+    with pytest.raises(CzError, match=rf"{name}: not a"):
+        asyncio.run(certify(tmp_path))
+
+
+def test_port_0_is_a_free_one_that_is_named(tmp_path, capsys):
+    with running(tmp_path, "--port", "0"):
+        url = re.search(r"OPC UA: (\S+)", capsys.readouterr().out)[1]
+        assert with_client(url, lambda hand: hand.read("step")) >= 0
+    assert not url.endswith(":0/")

@@ -1,7 +1,8 @@
-"""Comparison of a native vector environment with Gymnasium's vector of its scalar form, in every autoreset mode.
+"""A checker of vector environments: ``cz_gym.check_vector_env`` compares one with a vector of its scalar form.
 
-Further checks show that returned arrays are never written or read again. ``tests/environment/test_vector.py`` breaks
-Gymnasium's own vector in each of these ways.
+It takes any of Gymnasium's vector environments, not this package's alone. Slot i with seed ``seeds[i]`` must equal the
+scalar form with that seed: spaces, observations, rewards, ends, infos and autoreset. Returned arrays must never be
+written or read again. The first difference is told in one line.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -10,6 +11,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -40,9 +42,16 @@ class Driver:
     steps: int
     seed: int
     mode: AutoresetMode
+    infos: bool = True
+    rtol: float = 0.0
     episodes: int = 0
     failures: int = 0
     held: int = 0
+
+    @property
+    def seeds(self) -> list[int]:
+        """Seeds of the slots."""
+        return [self.seed + i for i in range(self.num_envs)]
 
     def vector(self) -> Any:
         """A new native form, as a context."""
@@ -53,11 +62,19 @@ class Driver:
         if not fact:
             raise NotConforming(f"[{self.mode.value}] {message}")
 
+    def begin(self, env: Any, seed: Any) -> Any:
+        """Reset an environment; :class:`NotConforming` if it does not take seeds as Gymnasium's own vectors do."""
+        try:
+            return env.reset(seed=seed)
+        except (TypeError, ValueError, gym.error.Error) as error:
+            said = " ".join(f"{type(error).__name__}: {error}".split())
+            raise NotConforming(f"[{self.mode.value}] reset(seed={seed}) raises {said:.200}") from error
+
     def run(self, env: Any, counts: bool = False, overwrites: bool = False) -> Iterator[Event]:
         """Reset and step with sampled actions, which ``overwrites`` spoils; if ``DISABLED``, reset ended slots."""
         env.action_space.seed(self.seed)
         over, none = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.bool_)
-        yield Event("reset", env.reset(seed=self.seed), ~none)
+        yield Event("reset", self.begin(env, self.seeds), ~none)
         for k in range(self.steps):
             action = env.action_space.sample()
             given = [(array.value, array.value.copy()) for array in flatten(action)]
@@ -82,18 +99,22 @@ def check_vector_env(
     make_vector: Callable[[int, AutoresetMode], Any],
     make_scalar: Callable[[], Any],
     *,
-    mode: AutoresetMode,
+    mode: AutoresetMode = AutoresetMode.NEXT_STEP,
     num_envs: int = 3,
     steps: int = 200,
     seed: int = 0,
     random_start: bool = True,
+    infos: bool = True,
+    rtol: float = 0.0,
 ) -> Driver:
-    """Raise :class:`NotConforming` in one line unless the native form equals a vector of scalars; return the counts.
+    """Raise :class:`NotConforming` in one line unless a vector environment equals a vector of scalars; return counts.
 
-    ``steps`` batched steps with sampled actions must end episodes (give a short horizon). ``random_start`` says whether
-    first observations of different episodes differ.
+    ``make_vector(num_envs, mode)`` makes the vector environment, ``make_scalar()`` the environment that each slot must
+    equal. ``steps`` batched steps with sampled actions must end episodes (give a short horizon). ``random_start`` says
+    whether first observations of different episodes differ, ``infos`` whether infos are compared too, ``rtol`` by how
+    much, relative to them, numbers may differ: 0 means bit for bit.
     """
-    driver = Driver(make_vector, make_scalar, num_envs, steps, seed, mode)
+    driver = Driver(make_vector, make_scalar, num_envs, steps, seed, mode, infos, rtol)
     _check_spaces(driver)
     _check_seeds(driver, random_start)
     _check_equality(driver, random_start)
@@ -118,7 +139,7 @@ def _check_spaces(driver: Driver) -> None:
 def _first(driver: Driver, seed: Any, env: Any = None) -> list[Any]:
     """Copies of the first observation of every slot; of a new environment unless one is given."""
     with driver.vector() if env is None else nullcontext(env) as env:
-        return deepcopy(list(iterate(env.observation_space, env.reset(seed=seed)[0])))
+        return deepcopy(list(iterate(env.observation_space, driver.begin(env, seed)[0])))
 
 
 def _check_seeds(driver: Driver, random_start: bool) -> None:
@@ -132,7 +153,7 @@ def _check_seeds(driver: Driver, random_start: bool) -> None:
     seeds = [seed + 7 * (n - i) for i in range(n)]
     for i, slot in enumerate(_first(driver, seeds)):
         with closing(driver.make_scalar()) as scalar:
-            differs = difference(flatten(slot), flatten(scalar.reset(seed=seeds[i])[0]))
+            differs = difference(flatten(slot), flatten(scalar.reset(seed=seeds[i])[0]), rtol=driver.rtol)
         driver.require(not differs, f"seed list: slot {i} with seed {seeds[i]} differs from the scalar with that seed")
     pairs = [
         (_first(driver, seed + 1000), expected, f"seeds {seed} and {seed + 1000} give the same first observations"),
@@ -158,7 +179,9 @@ def _check_equality(driver: Driver, random_start: bool) -> None:
             driver.require(one.call == other.call, f"{one.call} where the scalars have {other.call}")
             names = RESULT if len(one.result) == 5 else (RESULT[0], RESULT[-1])
             for name, ours, theirs in zip(names, one.result, other.result, strict=True):
-                found = difference(flatten(ours, name), flatten(theirs, name), masked=name == "info")
+                if name == "info" and not driver.infos:
+                    continue
+                found = difference(flatten(ours, name), flatten(theirs, name), name == "info", driver.rtol)
                 driver.require(not found, f"{one.call}: {found} (native and scalar)")
     driver.require(driver.episodes, f"no episode ended in {driver.steps} steps: give more, or a shorter horizon")
 
@@ -206,7 +229,9 @@ def flatten(value: Any, name: str = "") -> list[NamedArray]:
     return [NamedArray(name, value if isinstance(value, np.ndarray) else np.asarray(value))]
 
 
-def difference(one: Sequence[NamedArray], other: Sequence[NamedArray], masked: bool = False) -> str | None:
+def difference(
+    one: Sequence[NamedArray], other: Sequence[NamedArray], masked: bool = False, rtol: float = 0.0
+) -> str | None:
     """The first difference in words, or None; ``masked`` compares infos where masks are true, of any dtype but bool."""
     names = [[array.name for array in arrays] for arrays in (one, other)]
     if names[0] != names[1]:
@@ -216,6 +241,8 @@ def difference(one: Sequence[NamedArray], other: Sequence[NamedArray], masked: b
         if a.shape != b.shape or (a.dtype != b.dtype and (not masked or b.dtype == np.bool_)):
             return f"{name} is {a.dtype} {a.shape} and {b.dtype} {b.shape}"
         unlike = np.asarray((a != b) & ((a == a) | (b == b)))  # NaN is like NaN
+        if rtol and a.dtype.kind == "f":
+            unlike &= ~np.isclose(a, b, rtol=rtol, atol=rtol, equal_nan=True)
         if masked and mask is not None and a.ndim > 0 and mask.shape == a.shape[:1]:
             unlike &= mask.reshape(-1, *[1] * (a.ndim - 1))
         if unlike.any():

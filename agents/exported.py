@@ -1,0 +1,453 @@
+"""An ONNX file of any exporter as the plain graph of an agent file.
+
+Exporters write constants as nodes, weights into another file, recurrent layers with an axis of time, and shape
+arithmetic between them. Here constants are computed, axes of length 1 are left out, and GRU, LSTM and RNN become the
+operations of one step, so that what is left are operations on rows (n, width). :func:`.graph.check_graph` checks the
+result like every agent's graph; it alone reads files that others wrote.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .graph import INPUTS, OUTPUTS, GraphError
+
+OPSET, IR_VERSION = 17, 9
+"""Versions of the graphs that are written."""
+ALIASES = ("Identity", "Cast", "Dropout", "Unsqueeze", "Squeeze", "Flatten", "Reshape", "Transpose", "Expand")
+"""Operators that leave the numbers of a row as they are, where they leave its length."""
+GATES = {"RNN": 1, "GRU": 3, "LSTM": 4}
+"""Recurrent operators, and how many vectors of the state's length their weights give."""
+
+
+def to_plain(source: bytes | Path, channels: int) -> bytes:
+    """Rebuild an ONNX model as an agent's graph: ``observation`` (n, channels) to ``action`` (n, 2), with ``state``.
+
+    Further inputs and outputs become parts of the state, in order. GraphError says what no agent's graph can say.
+    """
+    import onnx
+    from google.protobuf.message import Error as ProtobufError
+    from onnx import inliner
+
+    try:
+        model = onnx.load(source) if isinstance(source, Path) else onnx.load_from_string(source)
+        if any(tensor.data_location == tensor.EXTERNAL for tensor in model.graph.initializer):
+            raise GraphError("keeps weights in another file: give the path of the ONNX file, beside which it lies")
+        if len(model.functions):
+            model = inliner.inline_local_functions(model)
+        before = model.SerializeToString()
+        plain = _Rebuilt(model, channels).serialised()
+        _compare(onnx.load_from_string(before), onnx.load_from_string(plain))
+        return plain
+    except GraphError:
+        raise
+    except (ProtobufError, onnx.checker.ValidationError, onnx.shape_inference.InferenceError, OSError,
+            ValueError, TypeError, RuntimeError, KeyError, IndexError, AttributeError) as error:  # fmt: skip
+        raise GraphError(f"not a sound ONNX model ({' '.join(str(error).split()):.120})") from None
+
+
+class _Rebuilt:
+    """The nodes of a model on rows of pullers, in the order of the model."""
+
+    def __init__(self, model: Any, channels: int) -> None:
+        from onnx import helper, numpy_helper, shape_inference
+
+        self.opset = next((each.version for each in model.opset_import if each.domain in ("", "ai.onnx")), OPSET)
+        self.constants: dict[str, Any] = {each.name: numpy_helper.to_array(each) for each in model.graph.initializer}
+        self.inputs = [each for each in model.graph.input if each.name not in self.constants]
+        for value in self.inputs:
+            _free_rows(value)
+        self.dims: dict[str, list[Any]] = {}
+        """Values of shape arithmetic; "n" where one is the number of pullers."""
+        while True:
+            del model.graph.value_info[:]
+            for value in model.graph.output:
+                value.type.tensor_type.ClearField("shape")
+            known = shape_inference.infer_shapes(model, data_prop=True).graph
+            self.shapes = {
+                value.name: [dim.dim_value or "n" for dim in value.type.tensor_type.shape.dim]
+                for value in (*known.input, *known.value_info, *known.output)
+                if value.type.tensor_type.HasField("shape")
+            }
+            if not self._fold(model.graph):  # computed lengths make more shapes known
+                break
+        self.rows: dict[str, str] = {}
+        """Name in the new graph of each value with rows."""
+        self.nodes: list[Any] = []
+        self.tensors: dict[str, Any] = {}
+        self.state = self._begin(channels)
+        for node in model.graph.node:
+            self._rows_of(node, {each.name: helper.get_attribute_value(each) for each in node.attribute})
+        self._end([value.name for value in model.graph.output])
+
+    def serialised(self) -> bytes:
+        """The new model."""
+        from onnx import TensorProto, checker, helper, numpy_helper
+
+        widths = ([self.channels, *self.width], [2, *self.width])
+        values = [
+            [
+                helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", k])
+                for name, k in zip(names, own, strict=False)
+            ]
+            for names, own in zip((INPUTS, OUTPUTS), widths, strict=True)
+        ]
+        tensors = [numpy_helper.from_array(array, name) for name, array in self.tensors.items()]
+        graph = helper.make_graph(self.nodes, "cz_gym_agent", values[0], values[1], tensors)
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
+        checker.check_model(model)
+        content: bytes = model.SerializeToString()
+        return content
+
+    def _begin(self, channels: int) -> list[int]:
+        """Name the inputs; returns the lengths of the parts of the state."""
+        if not self.inputs:
+            raise GraphError("has no input")
+        first, *others = (value.name for value in self.inputs)
+        lengths = [self._length(name) for name in (first, *others)]
+        if lengths[0] != channels:
+            raise GraphError(f"reads {lengths[0]} channels, not {channels}")
+        self.channels, self.width, self.rows[first] = channels, [sum(lengths[1:])] if others else [], INPUTS[0]
+        if len(others) == 1:
+            self.rows[others[0]] = INPUTS[1]
+        ends = np.cumsum([0, *lengths[1:]]).tolist()
+        for name, low, high in zip(others, ends, ends[1:], strict=False) if len(others) > 1 else ():
+            self.rows[name] = self._columns(INPUTS[1], low, high)
+        return lengths[1:]
+
+    def _end(self, names: list[str]) -> None:
+        """Name the outputs: the action, then the parts of the next state."""
+        for name in names:
+            if name not in self.rows:
+                raise GraphError("its outputs do not depend on its inputs")
+        lengths = [self._length(name) for name in names]
+        if lengths != [2, *self.state]:
+            expected = f"{2} numbers, the action" + "".join(f", then {k} of the next state" for k in self.state)
+            raise GraphError(f"gives {' and '.join(map(str, lengths))} numbers in {len(names)} outputs, not {expected}")
+        action, *state = (self.rows[name] for name in names)
+        self._emit("Identity", [action], OUTPUTS[0])
+        if state:
+            joined = state[0] if len(state) == 1 else self._emit("Concat", state, axis=1)
+            self._emit("Identity", [joined], OUTPUTS[1])
+
+    def _emit(self, operator: str, inputs: list[Any], name: str = "", **attributes: Any) -> str:
+        """Add a node of one output; inputs are names or arrays."""
+        from onnx import helper
+
+        name = name or f"v{len(self.nodes)}"
+        given = [each if isinstance(each, str) else self._tensor(each) for each in inputs]
+        self.nodes.append(helper.make_node(operator, given, [name], **attributes))
+        return name
+
+    def _tensor(self, array: Any) -> str:
+        array = np.asarray(array)
+        kept = array.astype(np.int64 if array.dtype.kind in "iub" else np.float32)
+        name = f"w{len(self.tensors)}"
+        self.tensors[name] = kept
+        return name
+
+    def _columns(self, rows: str, low: int, high: int) -> str:
+        return self._emit("Slice", [rows, np.array([low]), np.array([high]), np.array([1])])
+
+    def _shape(self, name: str) -> list[Any]:
+        if name not in self.shapes:
+            raise GraphError(f"has a value of unknown shape, {name!r:.60}")
+        return self.shapes[name]
+
+    def _length(self, name: str) -> int:
+        """Length of a value's rows; GraphError for a value that is more than one row a puller."""
+        others = [dim for dim in self._shape(name) if dim not in (1, "n")]
+        if len(others) > 1 or self._shape(name).count("n") != 1:
+            fixed = "" if "n" in self._shape(name) and others[1:] == [] else ": was it exported for a fixed batch?"
+            raise GraphError(f"has a value of shape {self._shape(name)}, not one row a puller{fixed}")
+        return int(others[0]) if others else 1
+
+    def _axis(self, name: str, axis: int) -> str:
+        """Tell of an axis whether it is the one of the pullers, the row's ("width"), or one of length 1."""
+        shape = self._shape(name)
+        axis %= len(shape)
+        others = [place for place, dim in enumerate(shape) if dim != "n"]
+        own = next((place for place in others if shape[place] != 1), others[-1] if others else -1)
+        return "pullers" if shape[axis] == "n" else "width" if axis == own else "one"
+
+    def _fold(self, graph: Any) -> bool:
+        """Compute the nodes of constants and known lengths, and remove them; True if there was one."""
+        from onnx import helper, numpy_helper
+
+        known, left = set(self.constants), []
+        for node in graph.node:
+            attributes = {each.name: helper.get_attribute_value(each) for each in node.attribute}
+            given = [name for name in node.input if name]
+            if node.op_type == "Shape" and given[0] in self.shapes and given[0] not in self.constants:
+                dims = self.shapes[given[0]]
+                self.dims[node.output[0]] = dims[attributes.get("start", 0) : attributes.get("end", len(dims))]
+                self._settle(node.output[0])
+            elif all(name in self.constants for name in given):
+                self._compute(node)
+            elif all(name in self.constants or name in self.dims for name in given):
+                self._count(node, attributes)
+            else:
+                lengths = self.dims.get(node.input[1], ()) if node.op_type == "Reshape" else ()
+                if list(lengths).count("n") == 1:
+                    self.constants[name := f"{node.input[1]} open"] = np.array([-1 if k == "n" else k for k in lengths])
+                    node.input[1] = name
+                left.append(node)
+        folded = len(left) < len(graph.node)
+        del graph.node[:]
+        graph.node.extend(left)
+        graph.initializer.extend(
+            numpy_helper.from_array(np.asarray(self.constants[name]), name) for name in self.constants.keys() - known
+        )
+        return folded
+
+    def _settle(self, name: str) -> None:
+        if "n" not in self.dims[name]:
+            self.constants[name] = np.array(self.dims.pop(name), np.int64)
+
+    def _count(self, node: Any, attributes: dict[str, Any]) -> None:
+        """Shape arithmetic: what picks and joins known lengths."""
+        parts = [
+            self.dims[name] if name in self.dims else np.atleast_1d(self.constants[name]).tolist()
+            for name in node.input
+            if name
+        ]
+        if node.op_type == "Gather":
+            found = [parts[0][int(i)] for i in parts[1]]
+            scalar = np.ndim(self.constants[node.input[1]]) == 0
+            self.dims[node.output[0]] = found
+            if scalar and found[0] != "n":
+                self.dims.pop(node.output[0])
+                self.constants[node.output[0]] = np.int64(found[0])
+                return
+        elif node.op_type == "Concat":
+            self.dims[node.output[0]] = [dim for part in parts for dim in part]
+        elif node.op_type in ("Mul", "Add", "Sub", "Div") and all(len(part) == 1 for part in parts):
+            (a,), (b,) = parts
+            known = {"Mul": lambda: a * b, "Add": lambda: a + b, "Sub": lambda: a - b, "Div": lambda: a // b}
+            if "n" in (a, b) and not (node.op_type == "Mul" and 1 in (a, b)):
+                raise GraphError("computes with the number of pullers")
+            self.dims[node.output[0]] = ["n" if "n" in (a, b) else known[node.op_type]()]
+        elif node.op_type in ("Unsqueeze", "Squeeze", "Cast", "Identity", "Reshape"):
+            self.dims[node.output[0]] = parts[0]
+        elif node.op_type == "Slice":
+            self.dims[node.output[0]] = parts[0][int(parts[1][0]) : int(parts[2][0])]
+        else:
+            raise GraphError(f"computes with the number of pullers, in {node.op_type}")
+        self._settle(node.output[0])
+
+    def _compute(self, node: Any) -> None:
+        """Compute a node of constants."""
+        from onnx import TensorProto, helper
+        from onnx.reference import ReferenceEvaluator
+
+        given = {name: self.constants[name] for name in node.input if name}
+        types = [helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(np.asarray(value).dtype), None)
+                 for name, value in given.items()]  # fmt: skip
+        outputs = [helper.make_tensor_value_info(name, TensorProto.UNDEFINED, None) for name in node.output]
+        graph = helper.make_graph([node], "constant", types, outputs)
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", self.opset)])
+        found: Any = ReferenceEvaluator(model).run(None, given)
+        self.constants.update(zip(node.output, found, strict=True))
+
+    def _operand(self, name: str) -> Any:
+        """An input of a new node: a value's rows, or a constant without axes of length 1 at its front."""
+        if name in self.rows or not name:
+            return self.rows.get(name, "")
+        array = np.asarray(self.constants[name])
+        while array.ndim > 1 and array.shape[0] == 1:
+            array = array[0]
+        return array
+
+    def _rows_of(self, node: Any, attributes: dict[str, Any]) -> None:
+        """Rebuild a node that depends on the inputs."""
+        operator, first = node.op_type, node.input[0]
+        if operator in GATES:
+            self._step(node, attributes)
+            return
+        for name in filter(None, node.output[:1] if operator == "Dropout" else node.output):
+            self._length(name)
+        if operator in ALIASES:
+            if self._length(first) != self._length(node.output[0]):
+                raise GraphError(f"its {operator} changes the length of a row")
+            self.rows[node.output[0]] = self.rows[first]
+        elif operator in ("Gather", "Slice", "Split", "Concat"):
+            self._parts(node, attributes)
+        elif operator in _OTHERS:
+            x = self.rows[first]
+            values = [self._operand(name) for name in node.input[1:]]
+            self.rows[node.output[0]] = _OTHERS[operator](self, x, values, attributes, self._length(first))
+        else:
+            if "axis" in attributes:
+                attributes["axis"] = -1 if self._axis(first, attributes["axis"]) == "width" else attributes["axis"]
+            operands = [self._operand(name) for name in node.input]
+            self.rows[node.output[0]] = self._emit(operator, operands, **attributes)
+
+    def _parts(self, node: Any, attributes: dict[str, Any]) -> None:
+        """Rebuild a node that picks, cuts or joins columns."""
+        operator, first, result = node.op_type, node.input[0], node.output[0]
+        values: list[Any] = [self.constants.get(name) for name in node.input[1:]]
+        if operator == "Slice":
+            axes: Any = values[2] if len(values) > 2 and values[2] is not None else range(len(values[0]))
+            rows = self.rows[first]
+            for place, axis in enumerate(np.asarray(axes).tolist()):
+                low, high = (int(each[place]) for each in values[:2])
+                step = int(values[3][place]) if len(values) > 3 and values[3] is not None else 1
+                if self._axis(first, axis) == "width":
+                    rows = self._emit("Slice", [rows, *(np.array([each]) for each in (low, high, 1, step))])
+                elif (low, step) != (0, 1) or high < (1 if self._axis(first, axis) == "one" else 2**31 - 1):
+                    raise GraphError("cuts another axis than that of the channels")
+            self.rows[result] = rows
+            return
+        axis = attributes.get("axis", 0)
+        kind = self._axis(result if operator == "Concat" else first, axis)
+        if operator == "Gather" and kind == "one":
+            self.rows[result] = self.rows[first]
+        elif kind != "width":
+            raise GraphError(f"its {operator} works on another axis than that of the channels")
+        elif operator == "Gather":
+            self.rows[result] = self._emit("Gather", [self.rows[first], np.atleast_1d(values[0])], axis=1)
+        elif operator == "Concat":
+            self.rows[result] = self._emit("Concat", [self._operand(name) for name in node.input], axis=1)
+        else:
+            ends = np.cumsum([0, *(self._length(name) for name in node.output)]).tolist()
+            for name, low, high in zip(node.output, ends, ends[1:], strict=False):
+                self.rows[name] = self._columns(self.rows[first], low, high)
+
+    def _step(self, node: Any, attributes: dict[str, Any]) -> None:
+        """One step of a recurrent layer in plain operations; ONNX's gates are in the orders z r h, and i o f c."""
+        kind, size = node.op_type, int(attributes["hidden_size"])
+        named = dict(zip(("X", "W", "R", "B", "lengths", "h", "c", "P"), [*node.input, *[""] * 8], strict=False))
+        usual = {"RNN": [b"Tanh"], "GRU": [b"Sigmoid", b"Tanh"], "LSTM": [b"Sigmoid", b"Tanh", b"Tanh"]}[kind]
+        other = attributes.get("activations", usual) != usual
+        if attributes.get("direction", b"forward") != b"forward" or other or named["P"]:
+            raise GraphError(f"its {kind} has two directions, peepholes or other activations")
+        if self._shape(named["X"])[attributes.get("layout", 0)] != 1:
+            raise GraphError(f"its {kind} reads more than one sample at a call")
+        if named["h"] not in self.rows or (kind == "LSTM" and named["c"] not in self.rows):
+            raise GraphError(f"its {kind} begins anew at every call: give its state as an input and an output")
+        W, R = (np.asarray(self.constants[named[name]])[0] for name in "WR")
+        B = np.asarray(self.constants[named["B"]])[0] if named["B"] else np.zeros(2 * GATES[kind] * size)
+        x, h = self.rows[named["X"]], self.rows[named["h"]]
+        inside = self._emit("Gemm", [x, W, B[: len(W)]], transB=1)
+        before = self._emit("Gemm", [h, R, B[len(W) :]], transB=1)
+
+        def gate(place: int, rows: str) -> str:
+            return self._columns(rows, place * size, (place + 1) * size)
+
+        if kind == "GRU":
+            z, r = (self._emit("Sigmoid", [self._emit("Add", [gate(i, inside), gate(i, before)])]) for i in range(2))
+            recalled = self._emit("Mul", [r, gate(2, before)])
+            if not attributes.get("linear_before_reset", 0):
+                reset = self._emit("Mul", [r, h])
+                recalled = self._emit("Gemm", [reset, R[2 * size :], B[len(W) + 2 * size :]], transB=1)
+            new = self._emit("Tanh", [self._emit("Add", [gate(2, inside), recalled])])
+            kept = self._emit("Mul", [z, self._emit("Sub", [h, new])])
+            after = [self._emit("Add", [new, kept])]
+        elif kind == "LSTM":
+            total = self._emit("Add", [inside, before])
+            i, o, f = (self._emit("Sigmoid", [gate(place, total)]) for place in range(3))
+            new = self._emit("Mul", [i, self._emit("Tanh", [gate(3, total)])])
+            cell = self._emit("Add", [self._emit("Mul", [f, self.rows[named["c"]]]), new])
+            after = [self._emit("Mul", [o, self._emit("Tanh", [cell])]), cell]
+        else:
+            after = [self._emit("Tanh", [self._emit("Add", [inside, before])])]
+        for name, rows in zip(node.output, [after[0], *after], strict=False):
+            if name:
+                self._length(name)
+                self.rows[name] = rows
+
+
+def _compare(before: Any, after: Any) -> None:
+    """GraphError unless both models give the same actions and states for some observations."""
+    from onnx.reference import ReferenceEvaluator
+
+    random, weights = np.random.default_rng(0), {each.name for each in before.graph.initializer}
+    inputs = [value for value in before.graph.input if value.name not in weights]
+    shapes = [[dim.dim_value or 3 for dim in value.type.tensor_type.shape.dim] for value in inputs]
+    wide = [value.type.tensor_type.elem_type == 11 for value in inputs]
+    rows = [
+        random.normal(size=shape).astype(np.float64 if big else np.float32)
+        for shape, big in zip(shapes, wide, strict=True)
+    ]
+    wanted = ReferenceEvaluator(before).run(None, dict(zip((value.name for value in inputs), rows, strict=True)))
+    n = rows[0].size // after.graph.input[0].type.tensor_type.shape.dim[1].dim_value
+    flat = [each.reshape(n, -1).astype(np.float32) for each in rows]
+    given = dict(zip(INPUTS, [flat[0], *([np.concatenate(flat[1:], axis=1)] if flat[1:] else [])], strict=False))
+    found = ReferenceEvaluator(after).run(None, given)
+    parts = [np.reshape(each, (n, -1)) for each in wanted]
+    for one, other in zip([parts[0], *([np.concatenate(parts[1:], axis=1)] if parts[1:] else [])], found, strict=True):
+        if one.shape != other.shape or not np.allclose(one, other, rtol=1e-3, atol=1e-4):
+            raise GraphError("would act otherwise once it is rebuilt: give a simpler network")
+
+
+def _free_rows(value: Any) -> None:
+    """Let an input have any number of rows: its first axis, or the second one of a state (1, n, width)."""
+    dims = value.type.tensor_type.shape.dim
+    if not len(dims) or value.type.tensor_type.elem_type not in (1, 11):
+        raise GraphError(f"its input {value.name!r:.60} is not of rows of numbers")
+    open_ones = [place for place, dim in enumerate(dims) if not dim.HasField("dim_value")]
+    longer = [place for place, dim in enumerate(dims[:-1]) if dim.dim_value != 1]
+    at = (open_ones or (longer if len(dims) > 2 else []) or [min(len(dims) - 2, 1)])[0]
+    for place, dim in enumerate(dims):
+        if place == max(at, 0):
+            dim.Clear()
+            dim.dim_param = "n"
+        elif not dim.HasField("dim_value"):
+            dim.Clear()
+            dim.dim_value = 1
+
+
+def _power(graph: _Rebuilt, x: str, values: list[Any], attributes: dict[str, Any], width: int) -> str:
+    exponent = float(np.asarray(values[0]).ravel()[0]) if not isinstance(values[0], str) else 0.0
+    if exponent == 2.0:
+        return graph._emit("Mul", [x, x])
+    if exponent == 0.5:
+        return graph._emit("Sqrt", [x])
+    raise GraphError("its Pow is neither a square nor a root")
+
+
+def _mean(graph: _Rebuilt, x: str, values: list[Any], attributes: dict[str, Any], width: int) -> str:
+    return graph._emit("MatMul", [x, np.full((width, 1), 1.0 / width)])
+
+
+def _sum(graph: _Rebuilt, x: str, values: list[Any], attributes: dict[str, Any], width: int) -> str:
+    return graph._emit("MatMul", [x, np.ones((width, 1))])
+
+
+def _gelu(graph: _Rebuilt, x: str, values: list[Any], attributes: dict[str, Any], width: int) -> str:
+    if attributes.get("approximate", b"none") != b"none":
+        raise GraphError("its Gelu is an approximate one")
+    risen = graph._emit("Add", [graph._emit("Erf", [graph._emit("Mul", [x, np.sqrt(0.5)])]), np.array(1.0)])
+    return graph._emit("Mul", [graph._emit("Mul", [x, np.array(0.5)]), risen])
+
+
+def _normalised(graph: _Rebuilt, x: str, values: list[Any], attributes: dict[str, Any], width: int) -> str:
+    scale, bias, mean, variance = values
+    gain = scale / np.sqrt(variance + attributes.get("epsilon", 1e-5))
+    return graph._emit("Add", [graph._emit("Mul", [x, gain]), bias - mean * gain])
+
+
+def _swish(graph: _Rebuilt, x: str, values: list[Any], attributes: dict[str, Any], width: int) -> str:
+    inner = graph._emit("Mul", [x, np.array(attributes.get("alpha", 1.0))])
+    return graph._emit("Mul", [x, graph._emit("Sigmoid", [inner])])
+
+
+def _limit(graph: _Rebuilt, x: str, values: list[Any], lower: bool) -> str:
+    if isinstance(values[0], str) or np.size(values[0]) != 1:
+        raise GraphError("its Min or Max compares with more than a number")
+    limit = np.asarray(values[0]).reshape(())
+    return graph._emit("Clip", [x, limit] if lower else [x, "", limit])
+
+
+_OTHERS: dict[str, Any] = {
+    "Pow": _power,
+    "ReduceMean": _mean,
+    "ReduceSum": _sum,
+    "Gelu": _gelu,
+    "BatchNormalization": _normalised,
+    "Swish": _swish,
+    "Max": lambda graph, x, values, attributes, width: _limit(graph, x, values, True),
+    "Min": lambda graph, x, values, attributes, width: _limit(graph, x, values, False),
+}
+"""Operators that agents do not have, in those that they have."""

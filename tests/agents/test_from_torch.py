@@ -1,0 +1,248 @@
+"""Networks of any library as agent files: torch modules, and ONNX models as ordinary exporters write them."""
+
+import io
+import json
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from torch import nn
+
+from cz_gym import agents
+from cz_gym.agents import recipes
+from cz_gym.agents.contract import AgentFileError, OnnxPolicy, facts_of, write_agent
+from cz_gym.agents.from_torch import save_agent
+from cz_gym.config import make_config
+from tests.contracts import facts
+
+CONFIG = make_config(observation="measured", action="rate", horizon=200.0)
+WIDTH, SIZE = 12, 8
+
+
+class MLP(nn.Module):
+    def __init__(self, *layers):
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(WIDTH, SIZE), *layers, nn.Linear(SIZE, 2))
+
+    def forward(self, x):
+        return self.layers(x)
+
+
+class Cell(nn.Module):
+    """A cell of one state, GRU or RNN, or of two, LSTM, which share a vector."""
+
+    def __init__(self, kind):
+        super().__init__()
+        self.cell, self.head = kind(WIDTH, SIZE), nn.Linear(SIZE, 2)
+
+    def forward(self, x, state):
+        if isinstance(self.cell, nn.LSTMCell):
+            state = self.cell(x, tuple(state.chunk(2, -1)))
+            return self.head(state[0]), torch.cat(state, -1)
+        state = self.cell(x, state)
+        return self.head(state), state
+
+
+class Sequence(nn.Module):
+    """A recurrent layer with an axis of time, of one step; an LSTM has two inputs and outputs besides."""
+
+    def __init__(self, kind, batch_first):
+        super().__init__()
+        self.layer, self.head, self.axis = kind(WIDTH, SIZE, batch_first=batch_first), nn.Linear(SIZE, 2), batch_first
+
+    def forward(self, x, *state):
+        state = tuple(each.unsqueeze(0) for each in state)
+        seen, after = self.layer(x.unsqueeze(int(self.axis)), state if len(state) > 1 else state[0])
+        after = after if isinstance(after, tuple) else (after,)
+        return (self.head(seen.squeeze(int(self.axis))), *(each.squeeze(0) for each in after))
+
+
+NETWORKS = {
+    "tanh": (lambda: MLP(nn.Tanh()), []),
+    "silu and layer norm": (lambda: MLP(nn.SiLU(), nn.LayerNorm(SIZE)), []),
+    "batch norm, gelu, dropout": (lambda: MLP(nn.Flatten(), nn.BatchNorm1d(SIZE), nn.GELU(), nn.Dropout()), []),
+    "GRU cell": (lambda: Cell(nn.GRUCell), [SIZE]),
+    "RNN cell": (lambda: Cell(nn.RNNCell), [SIZE]),
+    "LSTM cell": (lambda: Cell(nn.LSTMCell), [2 * SIZE]),
+    "GRU": (lambda: Sequence(nn.GRU, True), [SIZE]),
+    "LSTM": (lambda: Sequence(nn.LSTM, False), [SIZE, SIZE]),
+    "RNN": (lambda: Sequence(nn.RNN, True), [SIZE]),
+}
+"""Networks, and the widths of their states."""
+
+
+def exported(module, widths, rows=True):
+    """An ONNX model as torch's exporter writes it, with names of its own; ``rows``: of any number of pullers."""
+    examples = [torch.zeros(2, width) for width in (WIDTH, *widths)]
+    names = [f"in{i}" for i in range(len(examples))], [f"out{i}" for i in range(len(examples))]
+    axes = {name: {0: "batch"} for name in (*names[0], *names[1])} if rows else None
+    file = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.onnx.export(module.eval(), tuple(examples), file, dynamo=False, dynamic_axes=axes,
+                          input_names=names[0], output_names=names[1])  # fmt: skip
+    return file.getvalue()
+
+
+def measured_facts(**others):
+    return {**facts(), **facts_of(CONFIG), **others}
+
+
+@pytest.mark.parametrize("rows", [True, False])
+@pytest.mark.parametrize("name", NETWORKS)
+def test_models_of_an_ordinary_exporter_act_as_they_did(tmp_path, name, rows):
+    """Constants are nodes, a recurrent layer has an axis of time, inputs have other names."""
+    make, widths = NETWORKS[name]
+    torch.manual_seed(0)
+    module = make()
+    write_agent(tmp_path / "a.onnx", exported(module, widths, rows), **measured_facts())
+    agent = OnnxPolicy.load(tmp_path / "a.onnx", CONFIG)
+    assert agent.memory_length == sum(widths)
+    random = np.random.default_rng(0)
+    seen, state = random.normal(size=(5, WIDTH)).astype(np.float32), None
+    own = [torch.zeros(5, width) for width in widths]
+    for _ in range(3):
+        action, state = agent.predict(seen, state)
+        with torch.no_grad():
+            wanted = module(torch.tensor(seen), *own)
+        wanted, own = (wanted[0], list(wanted[1:])) if widths else (wanted, own)
+        np.testing.assert_allclose(action, wanted, atol=1e-5)
+
+
+def test_weights_beside_the_file_are_folded_in(tmp_path):
+    model = onnx.load_from_string(exported(MLP(nn.Tanh()), []))
+    onnx.save(model, tmp_path / "m.onnx", save_as_external_data=True, location="m.data", size_threshold=0)
+    write_agent(tmp_path / "a.onnx", tmp_path / "m.onnx", **measured_facts())
+    (tmp_path / "m.data").unlink()
+    assert OnnxPolicy.load(tmp_path / "a.onnx").predict(np.zeros(WIDTH, np.float32))[0].shape == (2,)
+
+
+def graph(*nodes, weights=(), inputs=(("x", [None, WIDTH]),), outputs=(("y", [None, 2]),)):
+    """A model of these nodes."""
+    values = [
+        [helper.make_tensor_value_info(n, TensorProto.FLOAT, dims) for n, dims in each] for each in (inputs, outputs)
+    ]
+    tensors = [numpy_helper.from_array(np.asarray(array), name) for name, array in weights]
+    made = helper.make_graph(list(nodes), "g", *values, tensors)
+    return helper.make_model(made, opset_imports=[helper.make_opsetid("", 17)], ir_version=9).SerializeToString()
+
+
+PICK = ("w", np.ones((WIDTH, 2), np.float32))
+
+
+def test_shape_arithmetic_halves_and_double_precision_are_computed(tmp_path):
+    """A model in double precision that reads the length of its rows."""
+    model = graph(
+        helper.make_node("Cast", ["x"], ["wide"], to=TensorProto.DOUBLE),
+        helper.make_node("Shape", ["wide"], ["shape"]),
+        helper.make_node("Constant", [], ["one"], value=numpy_helper.from_array(np.int64(1))),
+        helper.make_node("Gather", ["shape", "one"], ["width"]),
+        helper.make_node("Constant", [], ["two"], value=numpy_helper.from_array(np.int64(2))),
+        helper.make_node("Div", ["width", "two"], ["half"]),
+        helper.make_node("Constant", [], ["axes"], value=numpy_helper.from_array(np.array([0]))),
+        helper.make_node("Unsqueeze", ["half", "axes"], ["from"]),
+        helper.make_node("Unsqueeze", ["width", "axes"], ["to"]),
+        helper.make_node("Unsqueeze", ["one", "axes"], ["at"]),
+        helper.make_node("Slice", ["wide", "from", "to", "at"], ["later"]),
+        helper.make_node("MatMul", ["later", "w"], ["z"]),
+        helper.make_node("Cast", ["z"], ["y"], to=TensorProto.FLOAT),
+        weights=[("w", np.ones((WIDTH // 2, 2)))],
+    )
+    write_agent(tmp_path / "a.onnx", model, **measured_facts())
+    seen = np.arange(2.0 * WIDTH, dtype=np.float32).reshape(2, WIDTH)
+    action, _ = OnnxPolicy.load(tmp_path / "a.onnx").predict(seen)
+    np.testing.assert_allclose(action[:, 0], seen[:, WIDTH // 2 :].sum(axis=1), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("model", "says"),
+    [
+        (graph(helper.make_node("MatMul", ["x", "w"], ["m"]), helper.make_node("Softmax", ["m"], ["y"], axis=0),
+               weights=[PICK]), "uses the operator 'Softmax'"),
+        (exported(Sequence(nn.GRU, True), [SIZE]).replace(b"batch", b"batcj") + b"\0", "not a sound ONNX model"),
+    ],
+)  # fmt: skip
+def test_what_no_agent_may_hold_is_refused_where_it_is_loaded(tmp_path, model, says):
+    write_agent(tmp_path / "a.onnx", model, **measured_facts())
+    with pytest.raises(AgentFileError, match=says):
+        OnnxPolicy.load(tmp_path / "a.onnx")
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(recipes, "JUDGING_SEEDS", recipes.JUDGING_SEEDS[:4])
+
+
+@pytest.mark.parametrize("name", ["tanh", "GRU cell", "LSTM cell"])
+def test_a_module_is_saved_in_one_call(tmp_path, quick, name):
+    make, widths = NETWORKS[name]
+    torch.manual_seed(0)
+    module = make().train()
+    contract = agents.save_agent(
+        tmp_path / "mine.onnx", module, CONFIG, sum(widths), training_steps=500_000, training_seed=3
+    )
+    agent = OnnxPolicy.load(tmp_path / "mine.onnx", CONFIG)
+    assert agent.contract == contract
+    assert (contract.algorithm, contract.training_steps, contract.training_seed) == ("mine", 500_000, 3)
+    assert (contract.learned_from, contract.action, contract.observation) == ("reward", "rate", "measured")
+    assert contract.validation_cost > 0.0
+    assert module.training, "it goes on training"
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.mul_(30.0)
+    save_agent(tmp_path / "mine.onnx", module, CONFIG, sum(widths))
+    seen = np.random.default_rng(0).normal(size=(9, WIDTH)).astype(np.float32)
+    action, _ = OnnxPolicy.load(tmp_path / "mine.onnx").predict(seen)
+    assert np.abs(action).max() == 1.0, "the file clips"
+
+
+@pytest.mark.parametrize(
+    ("module", "options", "says"),
+    [
+        (nn.Linear(WIDTH, 4), {}, r"gives \[\(2, 4\)\] for two crystals, not \[\(2, 2\)\]"),
+        (Cell(nn.GRUCell), {}, "Cell fails on inputs of shape .2, 12.: "),
+        (Cell(nn.GRUCell), {"state_size": 5}, r"Cell fails on inputs of shape .2, 12. and .2, 5.: "),
+        (nn.Linear(73, 2), {}, "Linear fails on inputs of shape .2, 12."),
+        (MLP(nn.Tanh()), {"learned_from": "nothing"}, "learned_from must be 'reward', 'state' or 'plant'"),
+        (lambda x: x, {}, "this needs a Module"),
+    ],
+)
+def test_a_module_that_is_no_agent_is_refused(tmp_path, module, options, says):
+    with pytest.raises(ValueError, match=says) as caught:
+        save_agent(tmp_path / "a.onnx", module, CONFIG, **options)
+    assert "\n" not in str(caught.value)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_module_that_draws_its_actions_is_refused(tmp_path, quick):
+    class Noisy(MLP):
+        def forward(self, x):
+            return super().forward(x) + torch.randn(2)
+
+    with pytest.raises(AgentFileError, match=r"RandomNormal|act otherwise than the module"):
+        save_agent(tmp_path / "a.onnx", Noisy(nn.Tanh()), CONFIG)
+
+
+@pytest.mark.parametrize("change", [{"training_steps": 500_000}, {"learned_from": "reward"}, {"algorithm": "other"}])
+def test_a_contract_that_was_edited_is_refused(tmp_path, change):
+    """The hash of the network alone let a file of 64 million steps enter the class of one million."""
+    shipped = agents.shipped("ppo")
+    file, text = tmp_path / "a.onnx", json.loads(shipped.with_suffix(".json").read_text())
+    file.write_bytes(shipped.read_bytes())
+    file.with_suffix(".json").write_text(json.dumps(text))
+    assert OnnxPolicy.load(file).contract.hash == text["hash"]
+    assert text[next(iter(change))] not in change.values()
+    file.with_suffix(".json").write_text(json.dumps({**text, **change}))
+    with pytest.raises(AgentFileError, match=r"a\.json: changed after it was written \(its hash differs\)"):
+        OnnxPolicy.load(file)
+
+
+def test_the_hash_is_of_network_and_declarations():
+    contract = OnnxPolicy.load(agents.shipped("ppo")).contract
+    assert replace(contract).hash == contract.hash
+    others = {replace(contract, **each).hash for each in ({"sha256": "0" * 64}, {"training_seed": 77}, {"puller": "x"})}
+    assert len({contract.hash, *others}) == 4
