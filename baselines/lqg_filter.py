@@ -14,7 +14,7 @@ from scipy.linalg import expm
 from scipy.signal import cont2discrete
 
 from cz_gym.body.process import INPUTS, OUTPUTS, linearise
-from cz_gym.episodes.scenario import Scenario, Sensor
+from cz_gym.episodes.scenario import Distribution, Sensor
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.plant import Puller, hidden_load
 from cz_gym.support.units import MINUTE, MM
@@ -125,10 +125,13 @@ class NoiseModel:
         check_numbers(self, (*taus, "camera_sd", "pyrometer_sd"), ("fast_sd", "slow_sd", "drift_rate_sd", *walks))
 
 
-def expect_errors(noise: NoiseModel, scenario: Scenario, power: float) -> NoiseModel:
-    """The noise model with the errors of told values and readings that a scenario has, at this nominal power [W]."""
-    read = math.hypot(scenario.told.power_sd, scenario.readings.scale_sd * power)
-    return replace(noise, told_power_sd=read, told_temperature_sd=scenario.told.temperature_sd)
+def expect_errors(noise: NoiseModel, crystals: Distribution, power: float) -> NoiseModel:
+    """The noise model with the largest errors of told values and readings on crystals, at this nominal power [W]."""
+    alike = crystals.scenarios
+    powers = [math.hypot(each.told.power_sd, each.readings.scale_sd * power) for each in alike]
+    return replace(
+        noise, told_power_sd=max(powers), told_temperature_sd=max(each.told.temperature_sd for each in alike)
+    )
 
 
 class PlantModel(NamedTuple):

@@ -114,7 +114,7 @@ def scale_lqg(design: LQGDesign, config: Config) -> LQGDesign:
         heater_walk=known.heater_walk * config.heater_range / DEFAULT.power_range,
         start_radius_sd=max(scenario.pullers.start_radius_sd, known.start_radius_sd),
     )
-    noise = expect_errors(noise, scenario, make_puller(parameters_of(config)).Q_H_0)
+    noise = expect_errors(noise, config.scenario, make_puller(parameters_of(config)).Q_H_0)
     slack = HEATER_SLACK * drives.heater_step
     design = replace(design, noise=noise, ring=ring_of(sensor), heater_slack=slack, error_pull=None)
     if not (math.isfinite(drives.pull_window) or math.isfinite(drives.pull_slew)):

@@ -317,6 +317,9 @@ class TunedController:
             raise CzError(f"{self.name} has no goal on {scenario.name!r}, but on {', '.join(known)}")
         begins = find_scenario(self.begins_with) if self.begins_with not in ("", "start") else scenario
         start = self.start if self.begins_with == "start" else self.settings(begins)
+        if isinstance(start, LQGDesign):
+            met = self.crystals if scenario == RANDOMIZED else scenario
+            start = replace(start, noise=expect_errors(start.noise, met, make_puller().Q_H_0))
         more = self.robust if beyond(scenario, RANDOMIZED) else ()
         return replace(objective, start=start, parameters=(*self.parameters, *more))
 

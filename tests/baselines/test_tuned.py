@@ -48,6 +48,8 @@ def test_an_lqg_expects_the_errors_that_are_usual_on_its_scenario():
     assert sizes["randomized"] == (0.0, 0.0)
     assert sizes["hot-zone"] == (1000.0, 2.0)
     assert sizes["puller"] == pytest.approx((1153.9, 2.0), rel=1e-3)
+    searched = BEST_RETURN.objective(RANDOMIZED).start.noise  # half of its crystals are of hot-zone
+    assert (searched.told_power_sd, searched.told_temperature_sd) == (1000.0, 2.0)
     for name, row in (("hot-zone", 0.01), ("randomized", 0.1)):
         config = make_config(replace(SCENARIOS["nominal"], told=SCENARIOS["hot-zone"].told), horizon=3600.0, **PLAIN)
         run = rollout(BEST_RETURN.settings(SCENARIOS[name]).for_config(config), config, range(10))
