@@ -191,6 +191,7 @@ def test_energy_and_time_are_those_of_the_recipe(stage):
     ("changes", "way"),
     [
         ({"h_c": 0.7 * MM}, "frozen"),
+        ({"h_c": 1.0 * MM, "r_c": 87.5 * MM + 6.5 * MM}, "frozen"),
         ({"h_c": 9.3 * MM}, "detached"),
         ({"r_c": 87.5 * MM + 7.9 * MM}, "off"),
         ({"r_c": 2.1 * MM, "r_ref": 9.0 * MM, "L": 0.001}, "off"),
