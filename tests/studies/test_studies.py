@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 import yaml
 
-from cz_gym import agents
+from cz_gym import agents, make_puller
+from cz_gym.body.process import radius_model
 from cz_gym.evaluation import protocol
 from cz_gym.evaluation.protocol import CASES, TRAINING_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.tools.report.task_records import contract_hash
-from studies import cards, frontier, leaderboard, robustness, speed, stock
+from studies import cards, frontier, leaderboard, ranks, robustness, speed, stock
 
 FIGURES = {key: {"mean": 0.0, "ci95": [0.0, 0.5]} for key in (*(of.metric for of in cards.FIGURES), cards.RETURN)}
 
@@ -226,3 +227,42 @@ def test_an_altered_policy_scales_the_pull_and_holds_its_actions_back():
     v_0 = config.parameters.v_0
     np.testing.assert_array_equal(late.v_p[:3], v_0)
     np.testing.assert_allclose(late.v_p[3] - v_0, 2.0 * (plain.signals.v_p[0] - v_0), rtol=1e-5)
+
+
+# Ranks under moved estimates, and the limit
+
+
+def test_the_limit_is_what_a_simulated_linear_loop_has():
+    """Error and pull step of the filter and the regulator on the linear plant, from 4,000 runs of independent noise."""
+    puller, price, rng = make_puller(lam=0.5), 1.0, np.random.default_rng(5)
+    loop = ranks.linear_loop(puller, ranks.CAMERA, 1.0, price)
+    error, step = ranks.linear_error(puller, ranks.CAMERA, 1.0, price)
+    n, known = 4000, len(loop.A)
+    x, estimate, u = np.zeros((n, known)), np.zeros((n, known)), np.zeros((n, 2))
+    for _ in range(4000):
+        reading = x @ loop.H.T + rng.normal(size=(n, 2)) @ np.sqrt(loop.R)
+        estimate = estimate + (reading - estimate @ loop.H.T) @ loop.learns.T
+        move = -np.concatenate([estimate, u], axis=1) @ loop.F.T
+        u = u + move
+        x = x @ loop.A.T + u @ loop.B.T + rng.multivariate_normal(np.zeros(known), loop.Q, n)
+        estimate = estimate @ loop.A.T + u @ loop.B.T
+        if _ == 3999:
+            assert 1e-3 * np.sqrt((x[:, 0] ** 2).mean()) == pytest.approx(error, rel=0.05)
+            assert np.sqrt((move[:, 0] ** 2).mean()) * ranks.MM_PER_MIN == pytest.approx(step, rel=0.05)
+
+
+def test_the_limit_falls_with_the_zero_and_grows_with_the_noise():
+    puller = make_puller(lam=0.5)
+    assert ranks.zero_of(1.0) == pytest.approx(radius_model(puller).zero, rel=1e-9)
+    by_gain = [ranks.limit(puller, ranks.CAMERA, gain) for gain in ranks.GAINS]
+    by_noise = [ranks.limit(puller, noise) for noise in ranks.NOISES]
+    assert by_gain == sorted(by_gain)
+    assert by_noise == sorted(by_noise)
+
+
+@pytest.mark.slow
+def test_ranks_write_their_table_and_figure(tmp_path):
+    assert ranks.main(["paper-filtered", "pid-conventional", "--crystals", "2", "--out", str(tmp_path)]) == 0
+    table = (tmp_path / "table.md").read_text()
+    assert all(f"| {each.about} | " in table for each in ranks.variants())
+    assert (tmp_path / "ranks.png").read_bytes().startswith(b"\x89PNG")
