@@ -49,7 +49,7 @@ class Row(NamedTuple):
     c: Sequence[float]
     """The same row with the C."""
     rounded: Sequence[float] | None = None
-    """Where the row differs: that of C in double precision whose setpoints alone are rounded to single precision."""
+    """Row, where it differs, of C in double precision whose setpoints alone are rounded to single precision."""
 
 
 def rounded(runner: Runner) -> Any:

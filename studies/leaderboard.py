@@ -37,7 +37,7 @@ TOLD = {
     protocol.GROUPS[protocol.STATE]: "state, in training",
     protocol.GROUPS[protocol.PLANT]: "plant, in training",
 }
-"""What an agent was told, by the heading of its group."""
+"""Knowledge of an agent in training, by the heading of its group."""
 Claims = Mapping[str, tuple[float, str]]
 """RMSE [mm] on the first case, and the contract, that each submission claims."""
 

@@ -230,6 +230,8 @@ def test_the_linearisation_along_the_recipe():
     by_radius = 2.0 * np.pi * p.rho_s * r * v_g  # against length a wide crystal gains mass, a fast one none
     np.testing.assert_allclose(at.A[crown, 5], [by_radius, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-4 * by_radius)
     assert at.C[crown, 1, 5] == p.g
+    link = 4.0 * p.kappa_12 * np.array([p.T_1_0, p.T_2_0]) ** 3  # a kelvin of drift in T_1, held in T_2
+    assert at.load == pytest.approx(-p.G_2b * link[0] / (link[1] + p.G_2b), rel=1e-3)
 
 
 MIX = {"crown": 0.4, "body": 0.3, "tail": 0.3}
