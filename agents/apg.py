@@ -213,7 +213,7 @@ def leaky_means(interval: float, process: Process) -> tuple[npt.NDArray[Any], np
         features += [later - earlier for later, earlier in pairwise(chain)] + chain[-1:]
     features += [now["v_p_mean"], now["valid"], now["r_ref"], now["T_1_ref"] - now["T_1"]]
     features += [now[each.name] - now[each.to] for each in process.relative if each.name != "T_1"]
-    features += [now[name] for name in ("alpha_ref", "L", "v_p_ref", "Q_H_ref") if along]
+    features += [now[name] for name in ("alpha_ref", "L", "v_p_ref", "Q_H_ref", "edge_valid") if along]
     return np.tile(1.0 - share, len(averaged)), gain, np.stack(features, axis=1)
 
 

@@ -1,14 +1,16 @@
-"""Controllers of a whole crystal: PIDs on the bright ring with gains that change in the cones, and an LQG.
+"""Controllers of a whole crystal: PIDs on what the camera sees, their gains scheduled along it, and an LQG.
+
+Where the camera shows a bright ring, they read it; in most of the crown, whose meniscus is too flat, the edge.
 
 The ring moves with the meniscus height as well as with the radius, in the crown ten times as much as in the body. The
 compensator predicts the height's deviation from the recipe from the applied pull speed and takes its share off the
 ring, with both numbers scheduled on the length. Radii [m], speeds [m/s], temperatures [K], power [W].
 
-The LQG solves Kalman filter and regulator for the linearisation at lengths of the recipe, as if the crystal stayed
-there, and interpolates between, once for each of several shares of conduction. The filter reads ring, pyrometer and
-load cell: a radius that is too small and a meniscus that is too high look alike to the camera in the crown, but weigh
-differently. Three states are not the plant's: the interface's slow fluctuation, the drift of the hot zone, which the
-given recipe follows, and the error of that recipe.
+The LQG solves its regulator for the linearisation at lengths of the recipe, as if the crystal stayed there, and
+interpolates it and the filter's model between, once for each of several shares of conduction. The filter reads ring or
+edge, pyrometer and load cell: a radius that is too small and a meniscus that is too high look alike in the ring, but
+weigh differently. Its covariance moves on with the readings that there are. Three states are not the plant's: the
+interface's slow fluctuation, the drift of the hot zone, which the given recipe follows, and the error of that recipe.
 """
 
 import math
@@ -23,6 +25,7 @@ from cz_gym.crystal.process import CRYSTAL, LinearRecipe, linear_recipe
 from cz_gym.crystal.signals import Measured, TrueState
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.process import Process, scales, signals
+from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.units import HOUR, KILO, MM, MM_PER_MIN
 
 from .pid import HeaterMemory, PIDState, SeriesPID, TemperatureLoop
@@ -48,6 +51,12 @@ class CrystalPIDMemory(NamedTuple):
     """Predicted deviation of the meniscus height from the recipe's [m]."""
     filtered: Floats
     """Filtered radius error [m]."""
+    by_edge: Floats
+    """1 if the last good frame showed the edge, 0 if the ring."""
+    shift: Floats
+    """What is left of the jump from one reading to the other [m]."""
+    share: Floats
+    """Share of the edge's gain in the gain of now [-]."""
     pid: PIDState
     command: Floats
     """Last commanded pull speed above the recipe's [m/s]."""
@@ -58,9 +67,12 @@ class CrystalPIDMemory(NamedTuple):
 
 @dataclass(frozen=True)
 class CrystalPID(MeasuredController):
-    """v_p = recipe + K F (gain e), e the ring's error, less c_h(L) dh if it compensates.
+    """v_p = recipe + K F (gain e), e the error of the edge, or of the ring less c_h(L) dh if it compensates.
 
-    dh' = v_p - recipe - (a_h(L) + slow) dh, F = 1/(1 + T_f s); gain is 1 in the body, ``cone_gain`` in crown and tail.
+    dh' = v_p - recipe - (a_h(L) + slow) dh, F = 1/(1 + T_f s); gain is 1 in the body, ``cone_gain`` on the ring in
+    crown and tail, ``edge_gain`` on the edge. Where ring and edge take turns, the difference of their errors is taken
+    off and dies out within ``T_turn``, as does that of their gains; while the camera shows neither, the last error
+    stays.
     The integrator follows the applied pull speed within ``T_track``. The recipe's temperature is shifted to what the
     pyrometer shows at the start, as an operator does: the crystal grows there.
     """
@@ -69,7 +81,11 @@ class CrystalPID(MeasuredController):
 
     pid: SeriesPID = field(default_factory=SeriesPID)
     cone_gain: float = 1.0
-    """Gain of the error in crown and tail [-]."""
+    """Gain of the ring's error in crown and tail [-]."""
+    edge_gain: float = 1.0
+    """Gain of the edge's error [-]."""
+    T_turn: float = 120.0
+    """Time constant with which the difference of ring and edge dies out [s]."""
     compensates: bool = True
     """Takes the predicted height off the ring."""
     lam: float = 0.5
@@ -84,7 +100,7 @@ class CrystalPID(MeasuredController):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_numbers(self, positive=("T_track",), not_negative=("cone_gain", "slow", "T_f"))
+        check_numbers(self, positive=("T_track", "T_turn"), not_negative=("cone_gain", "edge_gain", "slow", "T_f"))
 
     @cached_property
     def schedule(self) -> LinearRecipe:
@@ -95,7 +111,10 @@ class CrystalPID(MeasuredController):
         """The applied pull speed and power continue."""
         zero = np.zeros_like(seen.v_p)
         pid = PIDState(zero, zero, seen.v_p / self.pid.K_p)
-        return CrystalPIDMemory(zero, zero, pid, seen.v_p, self.heater.at_rest(seen), seen.T_1 - seen.T_1_ref)
+        by_edge = np.where(seen.edge_valid > 0.5, 1.0, 0.0)
+        return CrystalPIDMemory(
+            zero, zero, by_edge, zero, by_edge, pid, seen.v_p, self.heater.at_rest(seen), seen.T_1 - seen.T_1_ref
+        )
 
     def step(self, seen: Any, memory: CrystalPIDMemory) -> tuple[Floats, Floats, CrystalPIDMemory]:
         """Pull speed and heater power above the recipe's, and the new memory."""
@@ -103,16 +122,28 @@ class CrystalPID(MeasuredController):
         forgets = np.interp(seen.L, at.L, at.a_h) + self.slow
         left = np.exp(-forgets * dt)
         height = left * memory.height + (1.0 - left) / forgets * seen.v_p
-        error = seen.ring_error - (np.interp(seen.L, at.L, at.c_h) * height if self.compensates else 0.0)
+        error, by_edge, shift = self._error(seen, memory, np.interp(seen.L, at.L, at.c_h) * height)
         pace = -math.expm1(-dt / self.T_f) if self.T_f > 0.0 else 1.0
         filtered = memory.filtered + pace * (error - memory.filtered)
+        share = memory.share - math.expm1(-dt / self.T_turn) * (by_edge - memory.share)
         missed = (seen.v_p - memory.command) / self.pid.K_p
         tracking = memory.pid.integral + min(dt / self.T_track, 1.0) * missed
-        gain = in_cones(self.cone_gain, seen.L, self.parameters)
+        on_ring = in_cones(self.cone_gain, seen.L, self.parameters)
+        gain = on_ring + share * (self.edge_gain - on_ring)
         pull, pid = self.pid.step(gain * filtered, memory.pid._replace(integral=tracking), dt)
         shifted = seen._replace(T_1_ref=seen.T_1_ref + memory.start)
         power, heat = self.heater.step(shifted, memory.heat, dt, self.v_0, self.heater_range)
-        return pull, power, CrystalPIDMemory(height, filtered, pid, pull, heat, memory.start)
+        return pull, power, CrystalPIDMemory(height, filtered, by_edge, shift, share, pid, pull, heat, memory.start)
+
+    def _error(self, seen: Any, memory: CrystalPIDMemory, risen: Floats) -> tuple[Floats, Floats, Floats]:
+        """The radius error by ring or edge [m], without a jump where they take turns; whose it is, and what is left of
+        the jump. ``risen`` is what the predicted height adds to the ring [m]."""
+        ring, edge = seen.valid > 0.5, seen.edge_valid > 0.5
+        by_edge = np.where(ring | edge, 1.0 * edge, memory.by_edge)
+        now = np.where(edge, seen.edge_error, seen.ring_error - (risen if self.compensates else 0.0))
+        fades = math.exp(-self.control_interval / self.T_turn) * memory.shift
+        shift = np.where(by_edge != memory.by_edge, memory.filtered - now, fades)
+        return np.where(ring | edge, now + shift, memory.filtered), by_edge, shift
 
 
 @dataclass(frozen=True)
@@ -142,10 +173,13 @@ which is estimated and not regulated."""
 _T_1, _FLUCTUATION, _DRIFT, _MASS = 2, 5, 6, 8
 _PLANT, _EXOGENOUS = [0, 1, 2, 3, 4, _MASS], slice(_FLUCTUATION, _MASS)
 """The states that are the plant's, in the order of its linearisation, and those that are not."""
-_SIZES = np.array([MM, MM, *[1.0] * 6, 0.1, MM_PER_MIN, KILO])
+SIZES = np.array([MM, MM, *[1.0] * 6, 0.1, MM_PER_MIN, KILO])
 """Sizes of the states and the drives, in SI units."""
-_SEEN = np.array([MM, 1.0, 1.0])
-"""Sizes of what is seen: ring [m], pyrometer [K], load cell [N]."""
+_RING, _PYROMETER, _WEIGHT, _EDGE = range(4)
+SENSORS = ("ring", "pyrometer", "weight", "edge")
+"""What is seen, in this order: ring [m], heater [K], load cell [N], edge [m]."""
+START_SD = np.array([0.2 * MM, 0.2 * MM, 1.0, 1.0, 0.3, 0.3, 1.0, 1.0, 0.01])
+"""Standard deviations of the states when an episode begins, in SI units."""
 
 
 class CrystalNoise(NamedTuple):
@@ -153,6 +187,8 @@ class CrystalNoise(NamedTuple):
 
     ring: float = 0.06 * MM
     """Noise of the ring [m]."""
+    edge: float = 0.3 * MM
+    """Noise of the crystal's edge, its bias included [m]."""
     pyrometer: float = 0.1
     """Noise of the pyrometer [K]."""
     weight: float = 0.4
@@ -197,12 +233,10 @@ class CrystalGains(NamedTuple):
     A: Floats
     B: Floats
     C: Floats
-    K: Floats
-    """From innovations to states."""
+    Q: Floats
+    """Covariance that the states gain in an interval."""
     F: Floats
     """From states and last drives to drives."""
-    S: Floats
-    """Inverse of the innovations' covariance."""
 
 
 @lru_cache(maxsize=12)
@@ -223,7 +257,7 @@ def design(
 def _at(
     A: Floats, B: Floats, C: Floats, load: float, dt: float, noise: CrystalNoise, weights: CrystalWeights
 ) -> tuple[Floats, ...]:
-    """A, B and C in discrete time, K and F at one length."""
+    """A, B and C in discrete time, Q and F at one length."""
     rates = 1.0 / np.array([noise.tau, noise.slow, noise.slow])
     whole = np.zeros((STATES + DRIVES, STATES + DRIVES))
     whole[np.ix_(_PLANT, _PLANT)], whole[_PLANT, STATES:] = A, B[:, :DRIVES]
@@ -231,19 +265,22 @@ def _at(
     whole[_EXOGENOUS, _EXOGENOUS] = -np.diag(rates)
     moved = expm(whole * dt)
     F_d, B_d = moved[:STATES, :STATES], moved[:STATES, STATES:]
-    seen = np.zeros((len(_SEEN), STATES))
-    seen[np.ix_([0, 2], _PLANT)], seen[1, _T_1], seen[1, _DRIFT:_MASS] = C, 1.0, -1.0
+    seen = np.zeros((4, STATES))
+    seen[np.ix_([_RING, _WEIGHT, _EDGE], _PLANT)] = C
+    seen[_PYROMETER, _T_1], seen[_PYROMETER, _DRIFT:_MASS] = 1.0, -1.0
     walks = np.array([1e-9, noise.height, *[noise.temperature] * 3, 0.0, 0.0, 0.0, noise.mass])
     sizes = np.array([noise.fluctuation, noise.drift, noise.recipe])
     Q = np.diag(walks**2 * dt)
     Q[_EXOGENOUS, _EXOGENOUS] = np.diag(sizes**2 * (1.0 - np.exp(-2.0 * rates * dt)))
-    R = np.diag([noise.ring**2, noise.pyrometer**2, noise.weight**2])
-    P = _solve(F_d.T, seen.T, Q, R, 1.0 / _SIZES[:STATES], 1.0 / _SEEN)
-    S: Floats = np.asarray(np.linalg.inv(seen @ P @ seen.T + R), np.float64)
     F = np.zeros((DRIVES, STATES + DRIVES))
     acts = [*range(REGULATED), *range(STATES, STATES + DRIVES)]
     F[:, acts] = _regulator(F_d[:REGULATED, :REGULATED], B_d[:REGULATED], weights)
-    return F_d, B_d, seen, P @ seen.T @ S, F, S
+    return F_d, B_d, seen, Q, F
+
+
+def variances(noise: CrystalNoise) -> Floats:
+    """Variances of ring, pyrometer, load cell and edge, in SI units."""
+    return np.square([noise.ring, noise.pyrometer, noise.weight, noise.edge])
 
 
 def _regulator(A: Floats, B: Floats, weights: CrystalWeights) -> Floats:
@@ -255,7 +292,7 @@ def _regulator(A: Floats, B: Floats, weights: CrystalWeights) -> Floats:
     steps = np.diag([weights.pull_step**-2.0, weights.power_step**-2.0])
     cost[REGULATED:, REGULATED:], cross[REGULATED:] = steps, -steps
     drives = steps + np.diag([weights.pull**-2.0, weights.power**-2.0])
-    sizes = np.delete(_SIZES, _MASS)
+    sizes = np.delete(SIZES, _MASS)
     S = _solve(move, act, cost, drives, sizes, sizes[REGULATED:], cross)
     gain = np.linalg.solve(drives + act.T @ S @ act, act.T @ S @ move + cross.T)
     return np.asarray(-gain, np.float64)
@@ -276,6 +313,8 @@ class CrystalLQGMemory(NamedTuple):
 
     x: Floats
     """Estimated states by each model, shape (n, models, 9)."""
+    P: Floats
+    """Covariances of their errors, shape (n, models, 9, 9)."""
     evidence: Floats
     """Logarithm of how well each model has predicted, the best one's zero, shape (n, models)."""
 
@@ -284,7 +323,7 @@ class CrystalLQGMemory(NamedTuple):
 class CrystalLQG(MeasuredController):
     """Filters and regulators for several shares of conduction, the drives weighted by how well each filter predicts.
 
-    What the camera does not see is not corrected while it is blind.
+    Ring and edge are read where the camera shows them; while it is blind, pyrometer and load cell are.
     """
 
     process: ClassVar[Process] = CRYSTAL
@@ -296,45 +335,60 @@ class CrystalLQG(MeasuredController):
     noise: CrystalNoise = field(default_factory=CrystalNoise)
     weights: CrystalWeights = field(default_factory=CrystalWeights)
     jump: float = 1.0 * MM
-    """Largest innovation of the ring that counts [m]."""
+    """Largest innovation of ring and edge that counts [m]."""
+    sensors: tuple[str, ...] = SENSORS
+    """Those of :data:`SENSORS` that it reads."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if odd := set(self.sensors) - set(SENSORS):
+            raise CzError(unknown_name_message("sensor", min(odd), SENSORS))
 
     def at_rest(self, seen: Any) -> CrystalLQGMemory:
         """On the recipe, as far as the first sample tells; no model is better than the others."""
         x = np.zeros((len(seen.L), len(self.models), STATES))
         x[:, :, REGULATED - 1] = (seen.T_1_ref - seen.T_1)[:, None]
-        return CrystalLQGMemory(x, np.zeros(x.shape[:2]))
+        P = np.broadcast_to(np.diag(START_SD**2), (*x.shape, STATES)).copy()
+        return CrystalLQGMemory(x, P, np.zeros(x.shape[:2]))
 
     def step(self, seen: Any, memory: CrystalLQGMemory) -> tuple[Floats, Floats, CrystalLQGMemory]:
         """Pull speed and heater power above the recipe's, and the new memory."""
         u = np.stack([seen.v_p, seen.Q_H], axis=1)
-        told = np.stack([seen.ring_error, seen.T_1 - seen.T_1_ref, seen.weight], axis=1)
-        blind = seen.valid < 0.5
-        states, drives = np.empty_like(memory.x), np.empty((*memory.x.shape[:2], DRIVES))
+        told = np.stack([seen.ring_error, seen.T_1 - seen.T_1_ref, seen.weight, seen.edge_error], axis=1)
+        always = np.ones_like(seen.L)
+        reads = np.stack([seen.valid > 0.5, always, always, seen.edge_valid > 0.5], axis=1)
+        reads *= [name in self.sensors for name in SENSORS]
+        limits = np.array([self.jump, np.inf, np.inf, self.jump])
+        states, errors = np.empty_like(memory.x), np.empty_like(memory.P)
+        drives = np.empty((*memory.x.shape[:2], DRIVES))
         evidence = memory.evidence * math.exp(-self.control_interval / self.forgets)
         for number, lam in enumerate(self.models):
             at = design(self.parameters, self.meniscus, self.control_interval, lam, self.noise, self.weights)
             near, share = _between(at.L, seen.L)
-            A, B, C, K, F, S = (_mix(each, near, share) for each in at[1:])
-            K[blind], S[blind] = without_ring(K[blind], S[blind])
+            A, B, C, Q, F = (_mix(each, near, share) for each in at[1:])
+            P, K, S = filtered(A @ memory.P[:, number] @ A.swapaxes(1, 2) + Q, C, reads, variances(self.noise))
             x = _times(A, memory.x[:, number]) + _times(B, u)
-            new = told - _times(C, x)
-            new[:, 0] = np.where(blind, 0.0, np.clip(new[:, 0], -self.jump, self.jump))
+            new = reads * np.clip(told - _times(C, x), -limits, limits)
             evidence[:, number] += 0.5 * (np.log(np.linalg.det(S)) - np.sum(new * _times(S, new), axis=1))
-            states[:, number] = x + _times(K, new)
+            states[:, number], errors[:, number] = x + _times(K, new), P
             drives[:, number] = _times(F, np.concatenate([states[:, number], u], axis=1))
         evidence -= evidence.max(axis=1, keepdims=True)
         weights = np.exp(evidence)[:, :, None]
         acts = (weights * drives).sum(axis=1) / weights.sum(axis=1)
-        return acts[:, 0], acts[:, 1], CrystalLQGMemory(states, evidence)
+        return acts[:, 0], acts[:, 1], CrystalLQGMemory(states, errors, evidence)
 
 
-def without_ring(K: Floats, S: Floats) -> tuple[Floats, Floats]:
-    """Gains and inverse covariance where the ring is not seen: those of pyrometer and load cell alone."""
-    covariance, gain, known = np.linalg.inv(S), np.zeros_like(K), np.zeros_like(S)
-    known[:, 0, 0] = 1.0  # of an innovation that is zero
-    known[:, 1:, 1:] = np.linalg.inv(covariance[:, 1:, 1:])
-    gain[:, :, 1:] = (K @ covariance)[:, :, 1:] @ known[:, 1:, 1:]
-    return gain, known
+def filtered(P: Floats, C: Floats, reads: Floats, noise: Floats) -> tuple[Floats, Floats, Floats]:
+    """Covariance after the readings, their gains, and the inverse of their covariance.
+
+    What is not read has no gain, and noise alone. ``noise`` are the variances of all readings.
+    """
+    C = C * reads[:, :, None]
+    cross = P @ C.swapaxes(1, 2)
+    S: Floats = np.asarray(np.linalg.inv(C @ cross + np.diag(noise)), np.float64)
+    K = cross @ S
+    after = P - K @ cross.swapaxes(1, 2)
+    return 0.5 * (after + after.swapaxes(1, 2)), K, S
 
 
 def _between(L: Floats, at: Floats) -> tuple[Any, Floats]:

@@ -336,6 +336,7 @@ CRYSTAL_LOOP = (
     Parameter("pid.N", 2.0, 100.0),
     Parameter("T_f", 2.0, 300.0),
     Parameter("cone_gain", 0.01, 2.0),
+    Parameter("edge_gain", 0.01, 3.0),
     Parameter("heater.K", 300.0, 3000.0),
     Parameter("heater.K_pull", 1.0, 300.0),
     Parameter("heater.T_pull", 3.0 * MINUTE, 3.0 * HOUR),
@@ -344,6 +345,7 @@ CRYSTAL_LOOP = (
 HEIGHT_MODEL = (Parameter("lam", 0.0, 1.0, log=False), Parameter("slow", 1e-5, 1e-2))
 CRYSTAL_DESIGN = (
     Parameter("noise.ring", 0.01 * MM, 0.5 * MM),
+    Parameter("noise.edge", 0.03 * MM, 2.0 * MM),
     Parameter("noise.height", 1e-6, 1e-3),
     Parameter("noise.cones", 0.3, 10.0),
     Parameter("noise.recipe", 0.1, 30.0),
@@ -424,14 +426,14 @@ CRYSTALS = (
     tuned_crystal(
         (*CRYSTAL_LOOP, *HEIGHT_MODEL),
         name="compensated",
-        meaning="PID on the ring less the height that the paper's compensator predicts along the recipe",
+        meaning="PID on the edge, or on the ring less the height that the paper's compensator predicts",
         start=CrystalPID(pid=COMPENSATED_GAINS, lam=0.0, slow=5.0e-4, cone_gain=0.2, T_f=20.0, heater=QUICK_HEATER),
         quoted=True,
     ),
     tuned_crystal(
         CRYSTAL_DESIGN,
         name="lqg-along",
-        meaning="Kalman filters of ring, pyrometer and load cell, and regulators, designed along the recipe",
+        meaning="Kalman filters of ring, edge, pyrometer and load cell, and regulators, designed along the recipe",
         start=CrystalLQG(
             noise=CrystalNoise(
                 ring=8.073e-5,

@@ -14,14 +14,14 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from cz_gym.body.process import BODY
-from cz_gym.camera.view import Camera, camera_for, check_camera
+from cz_gym.camera.view import Camera, camera_for, camera_sight, check_camera
 from cz_gym.crystal.plant import CrystalParameters
 from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.episodes.draw import Factors
 from cz_gym.episodes.scenario import FAMILIES, AnyScenario, Distribution, Mixture, Scenario
 from cz_gym.episodes.scenarios import RANDOMIZED, adapt_scenario, find_distribution, find_scenario, mix_of
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
-from cz_gym.physics.parameters import Parameters, Range
+from cz_gym.physics.parameters import Parameters, Range, pose_for
 from cz_gym.puller.file import DEFAULT, PullerFile, find_puller, to_toml
 from cz_gym.support.errors import CzError, require_type, unknown_name_message
 
@@ -79,7 +79,7 @@ class Config:
     parameters: Parameters = field(default_factory=Parameters)
     meniscus: MeniscusModel = HURLE
     camera: Camera = field(default_factory=Camera)
-    """The camera of ``observation="camera"``; nothing else depends on it."""
+    """The camera of ``observation="camera"``; a whole crystal's flags follow from where it stands."""
     puller: PullerFile = DEFAULT
     """The machine; scenario, parameters and control interval follow from it in :func:`make_config`."""
     process: Process = field(default=BODY, repr=False)
@@ -217,7 +217,10 @@ def make_config(
     steps = length / interval
     if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
         raise CzError(f"horizon {length:g} s must be a whole number of control intervals of {interval:g} s")
-    checked_camera = check_camera(camera_for(checked) if seen is None else seen, checked)
+    pose = machine.pose(machine.parameters) if parameters is None else pose_for(checked)
+    checked_camera = check_camera(camera_for(checked, pose) if seen is None else seen, checked)
+    if seen is not None and hasattr(checked, "lens_x"):
+        checked = checked._replace(**camera_sight(checked_camera)._asdict())
     return Config(
         *(drawn_from, model, observation, action, interval, length, checked, shape, checked_camera),
         puller=machine,

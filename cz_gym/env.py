@@ -601,16 +601,16 @@ class CzVectorEnv(EnvBase, VectorEnv[Array, Array, Array]):
 
 @shows_settings
 class CzCrystalEnv(CzEnv):
-    """A whole Czochralski crystal: crown, body and tail along a recipe, seeing only the camera's bright ring.
+    """A whole Czochralski crystal: crown, body and tail along a recipe, seeing only what camera and load cell show.
 
     ## Action Space
     That of ``Cz-v0``, about the recipe's pull speed and heater power at the length grown: an action of zero follows the
     recipe.
 
     ## Observation Space
-    "measured" (17 channels, :class:`cz_gym.crystal.signals.Measured`): ring, temperature and drives against the
-    recipe's values at the length grown and 5 and 25 mm later, cone angle, length, weight. "history" (78), the default,
-    adds the past, "state" (21) is the true state.
+    "measured" (19 channels, :class:`cz_gym.crystal.signals.Measured`): ring, temperature and drives against the
+    recipe's values at the length grown and 5 and 25 mm later, cone angle, length, weight, and the crystal's edge where
+    the camera shows no ring. "history" (95), the default, adds the past, "state" (21) is the true state.
 
     ## Rewards
     Those of ``Cz-v0``, with the radius of the recipe at this length as reference, and the mean pull speed against the

@@ -17,7 +17,7 @@ Another process is one more value, in a room of its own:
   numbers from ``slot.streams`` where it needs some.
 * Numbers that outlive a step, as a running mean of the pull speed: the fields of :attr:`Process.StepMemory` stand in
   the slot; ``begin`` sets them, ``update_memory`` moves them on at every step, ``cost_inputs`` may charge them.
-* Sensors beside camera and pyrometer: ``draw_sensor_noise`` draws their noise into such fields.
+* Sensors beside camera and pyrometer: ``read_sensors`` writes their readings into the fields of ``Sensed``.
 * Constants of an episode: fields of ``StepMemory`` that ``begin`` draws, or new ones of ``Episode`` and of the
   scenario.
 * Stages: numbers of the parameters, which ``derive`` hands on as constants.
@@ -132,8 +132,37 @@ def keep_memory(memory: Any, u: Any, nominal: Any, interval: Any) -> Any:
 
 
 @jittable
-def no_sensors(slot: Any) -> None:
+def no_sensors(slot: Any, m: Any) -> None:
     """A process that camera and pyrometer alone see."""
+
+
+class InImage(NamedTuple):
+    """A slot's crystal in the camera's image."""
+
+    r_c: Any
+    """Its radius by the last reading [m]; NaN: the image is black."""
+    inwards: Any
+    """Distance of the image's middle from the optical axis, towards the crystal's [m]."""
+
+
+_RADIUS_STEPS = 4
+
+
+@jittable
+def seen_radius(r_c: Any, ring: Any, h_c: Any, p: Any, m: Any) -> Any:
+    """The crystal's radius for a bright ring [m], by a fixed point that begins at ``r_c``."""
+    for _ in range(_RADIUS_STEPS):
+        r_c = ring - m.ring_offset(r_c, h_c, p)
+    return r_c
+
+
+@jittable
+def in_image(slot: Any, m: Any) -> Any:
+    """The crystal whose ring is at the last reading; the image is black while that is flagged invalid."""
+    p = slot.puller
+    ring = slot.ring + p.ring_bias
+    r_c = seen_radius(ring - p.ring_bias, ring, slot.h_seen, p, m)
+    return InImage(r_c if slot.valid > 0.0 else np.nan, 0.0)
 
 
 def no_stages(parameters: Any, machine: Any, stage: Any) -> Any:
@@ -223,9 +252,13 @@ class Process(NamedTuple):
     update_memory: Function = keep_memory
     """``update_memory(memory, u, nominal, interval)``: ``StepMemory`` after the drives have moved to u, counted from
     ``nominal``."""
-    draw_sensor_noise: Function = no_sensors
-    """``draw_sensor_noise(slot)``: writes a sample of sensors of its own into ``StepMemory``, with random numbers from
-    ``slot.streams``."""
+    Sensed: Any = NoMemory
+    """Numbers of a slot that sensors of its own write."""
+    read_sensors: Function = no_sensors
+    """``read_sensors(slot, m)``: writes a sample of them into ``Sensed``, with random numbers of ``slot.streams``;
+    may flag the ring's reading invalid."""
+    in_image: Function = in_image
+    """``in_image(slot, m)``: :class:`InImage`."""
     nominal_moves: bool = False
     """True where ``nominal`` depends on the state."""
     name: str = ""

@@ -14,11 +14,13 @@ from scipy.integrate import trapezoid
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
+from cz_gym.body.process import BODY
 from cz_gym.episodes.draw import FIRST_FRAME
 from cz_gym.episodes.rng import WORDS, normal, seed_stream
 from cz_gym.jit import hashed, jittable, kernel
 from cz_gym.physics.meniscus import HURLE, MeniscusModel
 from cz_gym.physics.plant import Puller
+from cz_gym.process import Process
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import MM
 
@@ -47,12 +49,17 @@ TOLERANCE = 12.0
 """Difference between a pixel's corners that counts as an edge [grey values]."""
 REFLECTIONS = 2
 """The first makes the ring's outer part and edge, the second the part nearer to the crystal."""
-_RADIUS_STEPS = 4
-"""Steps of the fixed point that gives the crystal's radius for a reading of the ring."""
 _APART = 1e-4
 """Distance in q of a mirrored ray's bracket from its start [-]."""
 _GOLDEN = 0.6180339887498949
 """Golden ratio: shifts the rays of successive columns evenly."""
+
+
+@jittable
+def first_row(inwards: Any, view: Any) -> Any:
+    """Row of the view in which an image begins whose middle lies ``inwards`` of the optical axis [m] on the melt."""
+    point = project(view.camera.aim - inwards, 0.0, 0.0, view)
+    return np.rint(point.row - 0.5 * ROWS)
 
 
 @jittable
@@ -110,7 +117,7 @@ def grey_value(row: Any, column: Any, scene: Any, view: Any) -> Any:
 
 
 @jittable
-def _pixel(row: Any, column: Any, corners: Any, scene: Any, view: Any) -> Any:
+def _pixel(row: Any, column: Any, top: Any, corners: Any, scene: Any, view: Any) -> Any:
     """Brightness of a pixel whose upper and lower corners are in the two rows of ``corners``.
 
     No two rays of a pixel share a row or a column, so that a level edge also moves in SUB x SUB steps. They are
@@ -125,7 +132,7 @@ def _pixel(row: Any, column: Any, corners: Any, scene: Any, view: Any) -> Any:
     for i in range(SUB):
         for j in range(SUB):
             down, right = (i + (j + offset) / SUB) / SUB, (j + (i + 0.5) / SUB) / SUB
-            total += grey_value(row + down, column + right, scene, view)
+            total += grey_value(top + row + down, column + right, scene, view)
     return total / (SUB * SUB)
 
 
@@ -137,25 +144,27 @@ def _rounded(value: Any, noisy: Any, stream: Any, view: Any) -> Any:
 
 
 @jittable
-def expose(scene: Any, view: Any, noisy: Any, stream: Any, image: Any) -> None:
+def expose(scene: Any, view: Any, noisy: Any, stream: Any, image: Any, top: Any) -> None:
     """Write the image of a scene, uint8 (ROWS, COLUMNS, 1); with shot noise from ``stream`` if ``noisy``.
+
+    ``top`` is the row of the view in which the image begins, a whole number: 0 unless the image follows a crystal.
 
     The left half is traced; the right half is its mirror image, because everything is symmetric about the axis.
     """
     corners = np.zeros((2, COLUMNS // 2 + 1))
     for row in range(-1, ROWS):
         for column in range(COLUMNS // 2 + 1):
-            corners[(row + 1) % 2, column] = grey_value(1.0 * (row + 1), 1.0 * column, scene, view)
+            corners[(row + 1) % 2, column] = grey_value(top + row + 1.0, 1.0 * column, scene, view)
         if row < 0:
             continue
         for column in range(COLUMNS // 2):
-            value = _pixel(row, column, corners, scene, view)
+            value = _pixel(row, column, top, corners, scene, view)
             image[row, column, 0] = _rounded(value, noisy, stream, view)
             image[row, COLUMNS - 1 - column, 0] = _rounded(value, noisy, stream, view)
 
 
 def _show(scene: Any, view: Any, image: Any) -> None:
-    expose(scene, view, False, np.zeros(WORDS, np.uint64), image)
+    expose(scene, view, False, np.zeros(WORDS, np.uint64), image, 0.0)
 
 
 _show_scene = kernel(_show)
@@ -169,33 +178,30 @@ def picture(r_c: float, h_c: float, puller: Puller, view: View) -> npt.NDArray[n
 
 
 @lru_cache(maxsize=8)
-def build_render(meniscus: MeniscusModel = HURLE) -> Any:
+def build_render(process: Process = BODY, meniscus: MeniscusModel = HURLE) -> Any:
     """Compile ``render(slots, active, view, images, start, stop)``: the images of the active slots.
 
-    A slot's image shows the crystal whose bright ring is at the last reading, errors included, on the meniscus of that
-    moment. It is black while the reading is flagged invalid. ``images``: uint8 of shape (n, ROWS, COLUMNS, 1).
+    A slot's image shows the crystal of the last reading, errors included, on the meniscus of that moment
+    (:class:`cz_gym.process.InImage`), or is black. ``images``: uint8 of shape (n, ROWS, COLUMNS, 1).
     """
-    ring_offset = meniscus.ring_offset
+    in_image = process.in_image
 
     def render(slots: Any, active: Any, view: Any, images: Any, start: int, stop: int) -> None:
         stream = np.zeros(WORDS, np.uint64)
         for i in range(start, stop):
             if not active[i]:
                 continue
-            slot = slots[i]
-            image, p = images[i], slot.puller
-            if slot.valid == 0.0:
+            slot, image = slots[i], images[i]
+            seen = in_image(slot, meniscus)
+            if np.isnan(seen.r_c):
                 image[:] = 0
                 continue
-            ring = slot.ring + p.ring_bias
-            r_c = ring - p.ring_bias
-            for _ in range(_RADIUS_STEPS):
-                r_c = ring - ring_offset(r_c, slot.h_seen, p)
             seed_stream(stream, slot.key, FIRST_FRAME + slot.k_seen)
             noisy = slot.episode.camera_sd > 0.0
-            expose(make_scene(r_c, slot.h_seen, p), view, noisy, stream, image)
+            scene = make_scene(seen.r_c, slot.h_seen, slot.puller)
+            expose(scene, view, noisy, stream, image, first_row(seen.inwards, view))
 
-    return kernel(render, hashed(*meniscus.functions))
+    return kernel(render, hashed(in_image, *meniscus.functions))
 
 
 # Detector of the bright ring in an image, which returns the crystal's radius.

@@ -9,9 +9,18 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from cz_gym.jit import jittable
+from cz_gym.jit import jittable, labelled
 from cz_gym.physics.meniscus import hurle_slope, profile_scale
-from cz_gym.physics.parameters import Parameters, Q, check_numbers
+from cz_gym.physics.parameters import (
+    CameraPose,
+    Parameters,
+    Q,
+    Sight,
+    check_numbers,
+    pose_for,
+    sight_of,
+)
+from cz_gym.physics.plant import make_puller
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import MM
 
@@ -21,7 +30,7 @@ IMAGE = (ROWS, COLUMNS, 1)
 SECOND_RADIATION = 1.438776877e-2
 """Second radiation constant h c / k_B [m K] (CODATA)."""
 _E = "estimate"
-_SILICON = Parameters()
+_SILICON, _POSE = Parameters(), CameraPose()
 _EMISSIVITIES = "order and range: Watanabe et al., High Temp. High Press. 31, 587 (1999)"
 
 
@@ -32,8 +41,8 @@ class Camera(NamedTuple):
     an industrial camera adjusts its exposure. :func:`camera_for` aims the camera at another puller's crystal.
     """
 
-    tilt: Annotated[float, Q("rad", "angle of the optical axis from the vertical", _E, 0.0)] = math.radians(20)
-    distance: Annotated[float, Q("m", "from the lens to the melt, along the optical axis", _E)] = 1.0
+    tilt: Annotated[float, Q("rad", "angle of the optical axis from the vertical", _E, 0.0)] = _POSE.tilt
+    distance: Annotated[float, Q("m", "from the lens to the melt, along the optical axis", _E)] = _POSE.distance
     aim: Annotated[float, Q("m", "radius at which the optical axis meets the melt", f"{_E}: r_0")] = _SILICON.r_0
     focal_length: Annotated[float, Q("m", "focal length", f"{_E}: a common lens")] = 50.0 * MM
     pixel_pitch: Annotated[float, Q("m", "side of a pixel", f"{_E}: 3.75 um of a 1280 x 960 sensor, binned 8 x 8")] = (
@@ -41,10 +50,12 @@ class Camera(NamedTuple):
     )
     wavelength: Annotated[float, Q("m", "effective wavelength", f"{_E}: CCD behind an infrared filter")] = 0.9e-6
     crucible_radius: Annotated[float, Q("m", "inner radius of the crucible's wall", "Parameters.R_cr")] = _SILICON.R_cr
-    wall_height: Annotated[float, Q("m", "wall bare above the melt, up to the heat shield's underside", _E)] = 0.12
+    wall_height: Annotated[float, Q("m", "wall bare above the melt, up to the heat shield's underside", _E)] = (
+        _POSE.wall_height
+    )
     wall_temperature: Annotated[float, Q("K", "wall of the crucible", "the plant's T_2 at its nominal")] = 1763.0
     wall_emissivity: Annotated[float, Q("1", "quartz with hot graphite behind", _E)] = 0.9
-    shield_radius: Annotated[float, Q("m", "radius of the heat shield's opening", _E)] = 0.18
+    shield_radius: Annotated[float, Q("m", "radius of the heat shield's opening", _E)] = _POSE.shield_radius
     shield_temperature: Annotated[float, Q("K", "heat shield", "Parameters.T_e")] = _SILICON.T_e
     shield_emissivity: Annotated[float, Q("1", "graphite", _E)] = 0.8
     opening_temperature: Annotated[float, Q("K", "what is seen through the shield's opening", _E)] = 600.0
@@ -60,17 +71,26 @@ class Camera(NamedTuple):
     full_well: Annotated[float, Q("1", "electrons of a binned pixel at grey value 255", _E)] = 1e4
 
 
-def camera_for(parameters: Parameters) -> Camera:
-    """The default camera for a puller: aimed at its crystal, with the heat shield's opening in proportion."""
-    default = Camera()
-    opening = (default.shield_radius - _SILICON.r_0) / (_SILICON.R_cr - _SILICON.r_0)
+def camera_for(parameters: Parameters, pose: CameraPose | None = None) -> Camera:
+    """The default camera for a puller, in a pose (None: the usual one): aimed at its crystal, in its hot zone."""
+    default, q = Camera(), labelled(Parameters, parameters)
+    warmer = make_puller(q).T_2_0 - make_puller(_SILICON).T_2_0
     return default._replace(
-        aim=parameters.r_0,
-        crucible_radius=parameters.R_cr,
-        shield_radius=parameters.r_0 + opening * (parameters.R_cr - parameters.r_0),
-        melt_temperature=parameters.T_m + parameters.dT_0,
-        crystal_temperature=parameters.T_m,
+        **(pose or pose_for(q))._asdict(),
+        aim=q.r_0,
+        crucible_radius=q.R_cr,
+        wall_temperature=default.wall_temperature + warmer,
+        shield_temperature=max(q.T_e, 1.0),
+        melt_temperature=q.T_m + q.dT_0,
+        melt_emissivity=q.eps,
+        crystal_temperature=q.T_m,
     )
+
+
+def camera_sight(camera: Camera) -> Sight:
+    """What decides where this camera sees a bright ring."""
+    pose = CameraPose(camera.tilt, camera.distance, camera.wall_height, camera.shield_radius)
+    return sight_of(pose, camera.aim, camera.pixel_pitch / camera.focal_length)
 
 
 def check_camera(camera: Camera, parameters: Parameters) -> Camera:
@@ -164,6 +184,7 @@ class Point(NamedTuple):
     column: Any
 
 
+@jittable
 def project(x: Any, y: Any, z: Any, view: View) -> Point:
     """Pixel coordinates of a point [m]: row and column, 0 at the image's upper left corner; arrays broadcast."""
     from_x, from_z = x - view.x, z - view.z

@@ -9,7 +9,14 @@ import numpy as np
 
 from cz_gym.episodes.draw import randomised
 from cz_gym.jit import force_inlined, jittable, joined, labelled
-from cz_gym.physics.parameters import CrystalRecipe, Parameters, check_numbers, check_parameters
+from cz_gym.physics.parameters import (
+    CrystalRecipe,
+    Parameters,
+    Sight,
+    check_numbers,
+    check_parameters,
+    sight_of,
+)
 from cz_gym.physics.plant import Puller, derive_puller, heating, interface
 from cz_gym.process import clip
 from cz_gym.support.errors import CzError, unknown_name_message
@@ -22,9 +29,11 @@ APART = (*STAGES, "begins", "heater_max")
 DRAWN = -1.0
 """Value of ``begins`` where each stage begins at its own length."""
 CrystalParameters: Any = NamedTuple(  # type: ignore[misc]
-    "CrystalParameters", [(name, float) for name in (*Parameters._fields, *CrystalRecipe._fields, *APART)]
+    "CrystalParameters",
+    [(name, float) for name in (*Parameters._fields, *CrystalRecipe._fields, *Sight._fields, *APART)],
 )
-"""A puller's :class:`~cz_gym.physics.parameters.Parameters`, its :class:`~cz_gym.physics.parameters.CrystalRecipe`, the
+"""A puller's :class:`~cz_gym.physics.parameters.Parameters`, its :class:`~cz_gym.physics.parameters.CrystalRecipe`, its
+camera's :class:`~cz_gym.physics.parameters.Sight`, the
 share of episodes [-] that grow each of the :data:`STAGES`, the length [m] at which they begin, or :data:`DRAWN`, and
 the heater's largest power [W]."""
 
@@ -40,7 +49,8 @@ def complete(parameters: Any, machine: Any, stage: Any = None) -> Any:
     given = check_parameters(parameters)
     check_numbers("recipe's", machine.recipe)
     power = math.inf if machine.heater_max is None else machine.heater_max
-    whole = CrystalParameters(*given, *map(float, machine.recipe), 1.0, 0.0, 0.0, 0.0, DRAWN, power)  # type: ignore[call-arg]
+    sight = sight_of(machine.pose(given), given.r_0)
+    whole = CrystalParameters(*given, *map(float, machine.recipe), *sight, 1.0, 0.0, 0.0, 0.0, DRAWN, power)  # type: ignore[call-arg]
     return check_shape(whole if stage is None else whole._replace(**_shares(stage, whole)))
 
 
@@ -136,7 +146,7 @@ NO_DISTURBANCE = Disturbance(0.0, 0.0)
 
 
 class Grown(NamedTuple):
-    """The constants of a crystal, besides those of its puller: recipe, fin, charge and stages."""
+    """The constants of a crystal, besides those of its puller: recipe, fin, charge, camera and stages."""
 
     alpha_0: float
     """Contact angle [rad]."""
@@ -167,6 +177,10 @@ class Grown(NamedTuple):
     m: float
     beta: float
     k_0: float
+    lens_x: float
+    lens_z: float
+    wall_height: float
+    pixel: float
     crown: float
     body: float
     tail: float
@@ -190,6 +204,7 @@ def derive(q: Any, f: Any, m: Any) -> Any:
         crown_length=q.crown_length, body_length=q.body_length, tail_length=q.tail_length,
         v_start=q.v_start, v_crown=q.v_crown, v_body=q.v_body, v_body_end=q.v_body_end, v_tail=q.v_tail,
         k_s=q.k_s, m=q.m, beta=q.beta, k_0=q.k_0,
+        lens_x=q.lens_x, lens_z=q.lens_z, wall_height=q.wall_height, pixel=q.pixel,
         crown=q.crown, body=q.body, tail=q.tail, whole=q.whole, begins=q.begins,
     )  # fmt: skip
     return joined(Crystal, p, grown)

@@ -15,11 +15,11 @@ from cz_gym.jit import jittable
 from cz_gym.physics.meniscus import MeniscusModel
 from cz_gym.physics.parameters import check_parameters
 from cz_gym.physics.plant import DRAW_SPAN, HEIGHT_MAX_IN_A, bias_offset, hidden_load
-from cz_gym.process import NO_OPERATING_POINT, Inputs, PerfectReadings, linearise
+from cz_gym.process import NO_OPERATING_POINT, InImage, Inputs, PerfectReadings, linearise, seen_radius
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import KILO, MM
 
-from . import plant, recipe, signals
+from . import plant, recipe, sight, signals
 from .plant import (
     APART,
     NO_DISTURBANCE,
@@ -46,8 +46,23 @@ class StepMemory(NamedTuple):
     """Exponential mean of the pull speed minus the recipe's over :data:`cz_gym.body.signals.PULL_MEMORY` [m/s]."""
     stop: Any
     """Length at which the episode ends with success [m]."""
+
+
+class Sensed(NamedTuple):
+    """Numbers that load cell and camera write at each sample."""
+
     load_cell: Any
     """Noise of the load cell's last reading [kg]."""
+    ring_error: Any
+    """Error of the ring's last valid reading [m]."""
+    edge: Any
+    """The camera's last reading of the crystal's edge [m]."""
+    edge_error: Any
+    """Its error when it was last valid [m]."""
+    edge_valid: Any
+    """1 if the camera reads the edge, else 0."""
+    edge_bias: Any
+    """Error of the edge that this crystal keeps [m]."""
 
 
 @lru_cache(maxsize=64)
@@ -111,6 +126,8 @@ def begin(slot: Any, m: Any) -> Any:
     recipe.reference_along(slot)
     recipe.fill(table, p, slot.episode, m)
     stage, u = recipe.draw_stage(slot)
+    slot.edge_bias = sight.EDGE_BIAS * slot.episode.camera_sd * normal(slot.streams[recipe.START])
+    slot.ring_error = slot.edge_error = 0.0
     start, stop = recipe.span(stage, u, table, p)
     slot.stop, slot.v_p_mean = stop, 0.0
     recipe.stretch(slot, (recipe.time_at(stop, table, p) - recipe.time_at(start, table, p)) / DRAW_SPAN)
@@ -145,13 +162,36 @@ def perfect_readings(x: Any, p: Any, m: Any) -> Any:
 def update_memory(memory: Any, u: Any, nominal: Any, interval: Any) -> Any:
     """The mean pull speed above the recipe's after an interval."""
     mean = moved_mean(memory.v_p_mean, u.v_p - nominal.v_p, interval)
-    return StepMemory(mean, memory.stop, 0.0 * memory.load_cell)
+    return StepMemory(mean, memory.stop)
 
 
 @jittable
-def draw_load_cell_noise(slot: Any) -> None:
-    """The load cell's noise, from the stream of the episode's start, which nothing else draws from once it runs."""
-    slot.load_cell = signals.LOAD_CELL_NOISE * slot.episode.camera_sd * normal(slot.streams[recipe.START])
+def read_sensors(slot: Any, m: Any) -> None:
+    """Load cell, edge and flags: a good frame shows either a ring or, where the meniscus is too flat, the edge alone.
+
+    The frame is the one of the ring's reading, with all its errors; the edge has noise and a bias of its own. Random
+    numbers are of the stream of the episode's start, which nothing else draws from once it runs.
+    """
+    p, e, stream = slot.puller, slot.episode, slot.streams[recipe.START]
+    slot.load_cell = signals.LOAD_CELL_NOISE * e.camera_sd * normal(stream)
+    noise = sight.EDGE_NOISE * e.camera_sd * normal(stream)
+    r_c, r_ref = seen_radius(slot.x.r_c, slot.ring, slot.h_seen, p, m), shape_at(slot.x.L, p, e).r
+    slot.edge_valid = 0.0 if sight.shows_ring(r_c, slot.h_seen, p) else slot.valid
+    slot.valid = slot.valid - slot.edge_valid
+    if slot.k_seen == slot.k:
+        slot.edge = r_c + slot.edge_bias + noise
+    if slot.valid > 0.0:
+        slot.ring_error = slot.ring - r_ref - recipe.value(slot.x.L, slot, recipe._ring)
+    if slot.edge_valid > 0.0:
+        slot.edge_error = slot.edge - r_ref
+
+
+@jittable
+def in_image(slot: Any, m: Any) -> Any:
+    """The crystal of the last frame; the image follows the recipe's radius, and is black while nothing is read."""
+    p = slot.puller
+    r_c = seen_radius(slot.x.r_c, slot.ring, slot.h_seen, p, m)
+    return InImage(r_c if slot.valid + slot.edge_valid > 0.0 else np.nan, p.r_0 - shape_at(slot.x.L, p, slot.episode).r)
 
 
 @jittable
@@ -184,6 +224,7 @@ CRYSTAL = BODY._replace(
     TrueState=signals.TrueState,
     Logged=signals.Logged,
     BriefInfo=signals.BriefInfo,
+    past=signals.PAST,
     relative=signals.RELATIVE,
     check=check,
     derive=plant.derive,
@@ -201,7 +242,9 @@ CRYSTAL = BODY._replace(
     check_points=check_points,
     StepMemory=StepMemory,
     update_memory=update_memory,
-    draw_sensor_noise=draw_load_cell_noise,
+    Sensed=Sensed,
+    read_sensors=read_sensors,
+    in_image=in_image,
     nominal_moves=True,
     name="CzCrystal-v0",
     table=recipe.TABLE,
@@ -237,7 +280,9 @@ class LinearRecipe(NamedTuple):
     B: Floats
     """Shape (points, 6, 4)."""
     C: Floats
-    """The bright ring [m] and the load cell [N] by the states, shape (points, 2, 6)."""
+    """The bright ring [m], the load cell [N] and the crystal's edge [m] by the states, shape (points, 3, 6)."""
+    shows_ring: npt.NDArray[np.bool_]
+    """Whether the camera shows a ring there on the recipe."""
     load: float
     """Heat load on the melt that comes with a kelvin of drift, which the recipe that is given follows [W/K]."""
 
@@ -265,21 +310,21 @@ def linear_recipe(parameters: Any, meniscus: MeniscusModel, lam: float = 1.0) ->
     lengths = np.linspace(0.0, end(p), _POINTS)
     points = [_at(float(L), table, p, meniscus) for L in lengths]
     load = float(hidden_load(0.5, p) - hidden_load(-0.5, p))
-    A, B, C = (np.stack(each) for each in zip(*points, strict=True))
-    return LinearRecipe(lengths, A, B, C, load)
+    A, B, C, shows = (np.stack(each) for each in zip(*points, strict=True))
+    return LinearRecipe(lengths, A, B, C, shows, load)
 
 
-def _at(L: float, table: Floats, p: Any, m: MeniscusModel) -> tuple[Floats, Floats, Floats]:
-    """A, B and C at a length."""
+def _at(L: float, table: Floats, p: Any, m: MeniscusModel) -> tuple[Floats, Floats, Floats, Any]:
+    """A, B and C at a length, and whether the camera shows a ring there."""
     row, share = recipe.place(L, p)
     x = CrystalState(*map(float, recipe.state_at(L, table, p, Episode())))
     u = Inputs(*(float(recipe.look_up(table, row, share, at)) for at in (recipe._v_p, recipe._Q_H)))
 
     def seen(x: Any, u: Any, d: Any) -> Any:
-        return x.r_c + m.ring_offset(x.r_c, x.h_c, p), weight(x, 0.0, p)
+        return x.r_c + m.ring_offset(x.r_c, x.h_c, p), weight(x, 0.0, p), x.r_c
 
     model = linearise(CRYSTAL, p, m, (x, u, NO_DISTURBANCE), INPUTS[2:], seen)
     moves, length = np.array(rates(x, u, NO_DISTURBANCE, p, m)), CrystalState._fields.index("L")
     drift = moves / moves[length]
     A, B = model.A - np.outer(drift, model.A[length]), model.B - np.outer(drift, model.B[length])
-    return A[np.ix_(_ROWS, _ROWS)], B[_ROWS], model.C[:, _ROWS]
+    return A[np.ix_(_ROWS, _ROWS)], B[_ROWS], model.C[:, _ROWS], sight.shows_ring(x.r_c, x.h_c, p)

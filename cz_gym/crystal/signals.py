@@ -14,7 +14,7 @@ from cz_gym.body.signals import outside
 from cz_gym.jit import jittable
 from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.plant import bias_offset, drift
-from cz_gym.process import DONE, HEATER_SCALE, PULL_SCALE, Relative, read_drives, signals
+from cz_gym.process import DONE, HEATER_SCALE, PULL_SCALE, Past, Relative, read_drives, signals
 from cz_gym.process import Channel as Channel
 from cz_gym.support.units import MINUTE, MM
 
@@ -70,9 +70,10 @@ class Measured(NamedTuple):
     """
 
     ring_error: Annotated[
-        Any, Channel("m", MM, "camera reading minus the recipe's ring at this length; the last valid one while invalid")
+        Any,
+        Channel("m", MM, "camera reading minus the recipe's ring at this length; the last valid error while invalid"),
     ]
-    valid: Annotated[Any, _MEASURED["valid"]]
+    valid: Annotated[Any, Channel("1", 1.0, "1 if the camera shows a ring and says its reading is good, else 0")]
     r_ref: Annotated[Any, Channel("m", _R, "radius reference minus r_0, at this length")]
     r_ref_5mm: Annotated[Any, Channel("m", _R, "the same 5 mm later")]
     r_ref_25mm: Annotated[Any, Channel("m", _R, "the same 25 mm later")]
@@ -88,6 +89,10 @@ class Measured(NamedTuple):
     v_p_ref: Annotated[Any, Channel("m/s", PULL_SCALE, "the recipe's pull speed minus v_0; the scale is v_0")]
     Q_H_ref: Annotated[Any, Channel("W", HEATER_SCALE, "the recipe's heater power minus nominal")]
     weight: Annotated[Any, Channel("N", 5.0, "the load cell's reading minus the recipe's weight at this length")]
+    edge_error: Annotated[
+        Any, Channel("m", MM, "camera reading of the crystal's edge minus r_ref; the last valid error while invalid")
+    ]
+    edge_valid: Annotated[Any, Channel("1", 1.0, "1 if the camera shows no ring but the crystal's edge, else 0")]
 
 
 @jittable
@@ -96,8 +101,11 @@ def measure(x: Any, u: Any, nominal: Any, memory: Any, readings: Any, slot: Any,
     p, e, L, read = slot.puller, slot.episode, x.L, read_drives(u, slot)
     near, far = later(L, NEAR, p), later(L, FAR, p)
     now, shift = shape_at(L, p, e), drift(t, e) - p.T_1_0
+    moves = 1.0 * (slot.k_seen == slot.k)  # a held edge has no derivative
+    ring = readings.ring - now.r - value(L, slot, recipe._ring)
+    edge = slot.edge + moves * (x.r_c - x.r_c.real) - now.r
     return Measured(
-        ring_error=readings.ring - now.r - value(L, slot, recipe._ring),
+        ring_error=slot.valid * ring + (1.0 - slot.valid) * slot.ring_error,
         valid=slot.valid,
         r_ref=now.r - p.r_0,
         r_ref_5mm=shape_at(near, p, e).r - p.r_0,
@@ -113,7 +121,9 @@ def measure(x: Any, u: Any, nominal: Any, memory: Any, readings: Any, slot: Any,
         L=L,
         v_p_ref=nominal.v_p - p.v_0,
         Q_H_ref=nominal.Q_H - (p.Q_H_0 + e.told_power),
-        weight=weight(x, memory.load_cell, p) - p.g * (value(L, slot, recipe._M_s) + value(L, slot, recipe._M_men)),
+        weight=weight(x, slot.load_cell, p) - p.g * (value(L, slot, recipe._M_s) + value(L, slot, recipe._M_men)),
+        edge_error=slot.edge_valid * edge + (1.0 - slot.edge_valid) * slot.edge_error,
+        edge_valid=slot.edge_valid,
     )
 
 
@@ -201,7 +211,11 @@ class Logged(NamedTuple):
     H: Annotated[Any, Channel("m", 1.0, "depth of the melt in the crucible, which the lift follows")]
     v_over_G: Annotated[Any, Channel("1", 1.0, "v/G, growth rate by temperature gradient, relative to the recipe's")]
     dopant: Annotated[Any, Channel("1", 1.0, "dopant that the crystal takes up, relative to its first part's")]
-    r_br_measured: Annotated[Any, _LOGGED["r_br_measured"]]
+    r_br_measured: Annotated[Any, Channel("m", 1.0, "the camera's reading of the ring, where it shows one")]
+    edge_measured: Annotated[
+        Any, Channel("m", 1.0, "the camera's reading of the crystal's edge, where it shows no ring")
+    ]
+    edge_valid: Annotated[Any, Channel("bool", 1.0, "whether the camera shows no ring but the crystal's edge")]
     ring_offset: Annotated[Any, _LOGGED["ring_offset"]]
     term_radius: Annotated[Any, _LOGGED["term_radius"]]
     term_pull: Annotated[Any, _LOGGED["term_pull"]]
@@ -266,6 +280,8 @@ def logged(slot: Any, measured: Any, cost: Any, t: Any, ring: Any, m: Any) -> An
         v_over_G=(at.v_g / at.Phi_s) / (now.v_g / Phi_s),
         dopant=x.N / left,
         r_br_measured=slot.ring,
+        edge_measured=slot.edge,
+        edge_valid=slot.edge_valid,
         ring_offset=bias_offset(t, slot.episode),
         term_radius=cost.radius,
         term_pull=cost.pull,
@@ -294,6 +310,8 @@ def brief_info(slot: Any, measured: Any) -> Any:
     return BriefInfo(slot.x.r_c, r_ref, out_of_tolerance(slot, measured), succeeded(slot))
 
 
+PAST = (*body.PAST, Past("edge_error", 0.2 * MM))
+"""Signals whose past "history" shows."""
 RELATIVE = (
     Relative("r_ref_5mm", "r_ref", 2.0 * MM, "change of the radius reference within 5 mm"),
     Relative("r_ref_25mm", "r_ref", 10.0 * MM, "change of the radius reference within 25 mm"),

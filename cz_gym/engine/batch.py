@@ -122,7 +122,7 @@ class Batch:
         if self._camera:
             self._view = make_view(config.camera)
             seen = (self.memory.slots, self._all, self._view, out.image, 0, 1)
-            self._images_of = entry(build_render(config.meniscus), seen)
+            self._images_of = entry(build_render(config.process, config.meniscus), seen)
         self._pool: ThreadPoolExecutor | None = None
         self._owner = os.getpid()
 

@@ -49,8 +49,8 @@ def slot_type(process: Process) -> np.dtype[Any]:
     processes [standard deviations], the episode's random streams, as far as they are drawn from, the power that heats
     [W] where the heater is slow, the pyrometer's filter with the true temperature at the last sample [K], the nominal
     drives [m/s, W] from which the last action was counted, what resolution and delay change in the readings of the
-    drives [m/s, W], and what the process adds: the fields of ``StepMemory`` and
-    its table.
+    drives [m/s, W], and what the process adds: the fields of ``StepMemory``
+    and ``Sensed``, and its table.
     """
     number, whole, table = np.float64, np.int64, process.table
     return np.dtype(
@@ -71,7 +71,7 @@ def slot_type(process: Process) -> np.dtype[Any]:
             ("streams", np.uint64, (len(Stream), WORDS)),
             *((name, number) for name in ("Q_heats", "T_filtered", "T_1_before")),
             *((name, number) for name in ("v_p_nominal", "Q_H_nominal", "v_p_misread", "Q_H_misread")),
-            *((name, number) for name in process.StepMemory._fields),
+            *((name, number) for name in (*process.StepMemory._fields, *process.Sensed._fields)),
             *([("table", number, table)] if table[0] else []),
         ],
         align=True,
@@ -316,7 +316,7 @@ def _sample(memory: Any, i: Any, fresh: Any, fixed: Any, scales: Any, out: Any, 
         camera, pyrometer = sample_noise(slot.episode, slot.streams)
         sample_sensors(slot, camera, pyrometer, memory.frames[i], t, seen)
         sample_drives(slot, memory.frames[i], fixed.interval)
-        process.draw_sensor_noise(slot)
+        process.read_sensors(slot, model.meniscus)
     u, before = labelled(Inputs, slot), Inputs(slot.v_p_before, slot.Q_H_before)
     step_memory = labelled(process.StepMemory, slot)
     nominal = Inputs(slot.v_p_nominal, slot.Q_H_nominal)

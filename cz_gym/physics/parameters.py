@@ -168,6 +168,15 @@ _TABLES: dict[str, dict[str, Quantity]] = {
         "pyrometer_filter": Q("s", "time constant of the pyrometer's filter, a first-order lag", "",
                               0.0, MAX_LAG, drawn=True, later=True),
     },
+    "camera": {
+        "tilt": Q("deg", "angle of the camera's optical axis from the vertical",
+                  f"{_E}: viewports stand 15 to 35 deg off", 0.0, 80.0),
+        "distance": Q("mm", "from the lens to the melt, along the optical axis", _E, 50.0, 1e4),
+        "wall_height": Q("mm", "wall of the crucible that is bare above the melt, up to the heat shield", _E,
+                         1.0, 2e3, "bare_wall"),
+        "shield_radius": Q("mm", "radius of the heat shield's opening", f"{_E}: r_0 and 48 % of what is left to R_cr",
+                           2.0, 2e3),
+    },
     "melt": {
         "fluctuation_sd": Q("K", "standard deviation of the fast and of the slow fluctuation of the melt, "
                             "each drawn on its own", "", 0.0, 100.0, drawn=True),
@@ -262,6 +271,45 @@ class CrystalRecipe(NamedTuple):
     m: float = 0.5
     beta: float = 0.15
     k_0: float = 0.8
+
+
+class CameraPose(NamedTuple):
+    """Place of the camera above the melt and what its ring mirrors; the table ``[camera]`` of a puller file."""
+
+    tilt: float = math.radians(20.0)
+    distance: float = 1.0
+    wall_height: float = 0.12
+    shield_radius: float = 0.18
+
+
+def pose_for(q: Parameters) -> CameraPose:
+    """The usual pose at a puller, with the heat shield's opening in proportion."""
+    usual, silicon = CameraPose(), Parameters()
+    opening = (usual.shield_radius - silicon.r_0) / (silicon.R_cr - silicon.r_0)
+    return usual._replace(shield_radius=q.r_0 + opening * (q.R_cr - q.r_0))
+
+
+class Sight(NamedTuple):
+    """What decides where a camera sees a bright ring: lens, bare wall and pixel."""
+
+    lens_x: float
+    """Distance of the lens from the axis [m]."""
+    lens_z: float
+    """Height of the lens above the melt [m]."""
+    wall_height: float
+    """Height of the bare wall above the melt [m]."""
+    pixel: float
+    """Side of a pixel in focal lengths [-]."""
+
+
+PIXEL = 6e-4
+"""Side of a pixel of the usual camera, in focal lengths [-]: 30 um behind 50 mm."""
+
+
+def sight_of(pose: CameraPose, aim: float, pixel: float = PIXEL) -> Sight:
+    """The sight of a camera in this pose that is aimed at this radius [m]."""
+    across, up = pose.distance * math.sin(pose.tilt), pose.distance * math.cos(pose.tilt)
+    return Sight(aim + across, up, pose.wall_height, pixel)
 
 
 def describe(kind: type[Any] = Parameters) -> dict[str, Quantity]:

@@ -20,7 +20,16 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.physics.parameters import MACHINE, CrystalRecipe, Parameters, Quantity, Range, check_parameters
+from cz_gym.physics.parameters import (
+    MACHINE,
+    CameraPose,
+    CrystalRecipe,
+    Parameters,
+    Quantity,
+    Range,
+    check_parameters,
+    pose_for,
+)
 from cz_gym.physics.plant import RADIUS_LIMIT, check_height, make_puller
 from cz_gym.process import HEATER_SCALE
 from cz_gym.support.errors import CzError, unknown_name_message
@@ -34,8 +43,8 @@ TABLES = {
     for table in dict.fromkeys(quantity.table for quantity in MACHINE.values())
 }
 """The tables of the file, and the keys of each."""
-OPTIONAL = "recipe"
-"""The table whose absence needs no word: only ``CzCrystal-v0`` reads it."""
+OPTIONAL = ("recipe", "camera")
+"""The tables whose absence needs no word: only ``CzCrystal-v0`` and images read them."""
 
 
 def read_numbers(text: str) -> tuple[Any, dict[str, Any], tuple[str, ...]]:
@@ -60,8 +69,8 @@ def read_numbers(text: str) -> tuple[Any, dict[str, Any], tuple[str, ...]]:
             quantity, number = known[key], _read(value, known[key])
             pair = quantity.drawn and not isinstance(number, tuple)
             numbers[quantity.symbol] = (number, number) if pair else number
-        if table in content or table != OPTIONAL:
-            missing += [key for key in known if key not in given]
+        if table in content or table not in OPTIONAL:
+            missing += [key for key in known if key not in given and table != "camera"]
     return content.get("name"), numbers, tuple(missing)
 
 
@@ -156,6 +165,10 @@ class PullerFile:
     outlier_probability: float | None = None
     outlier_sd: float | None = None
     pyrometer_filter: Range | None = None
+    tilt: float | None = None
+    distance: float | None = None
+    wall_height: float | None = None
+    shield_radius: float | None = None
     fluctuation_sd: Range | None = None
     tau_fast: float | None = None
     tau_slow: float | None = None
@@ -190,12 +203,12 @@ class PullerFile:
 
     @cached_property
     def hash(self) -> str:
-        """SHA-256 of everything but the name, and the recipe, which is in the plant's hash (16 hex digits)."""
+        """SHA-256 of everything but name, recipe and camera; the plant's hash has the latter two (16 hex digits)."""
         plain, later = [], {}
         for quantity in MACHINE.values():
             value = value_of(self, quantity)
             value = value if value is None else (np.asarray(value, float) + 0.0).tolist()
-            if quantity.table == OPTIONAL:
+            if quantity.table in OPTIONAL:
                 continue
             if not quantity.later:
                 plain.append(value)
@@ -214,6 +227,11 @@ class PullerFile:
         """Change of the heater's power by an action of 1: its range, or the rest up to its largest power [W]."""
         room = math.inf if self.heater_max is None else self.heater_max - make_puller(self.parameters).Q_H_0
         return min(self.heater_range, room)
+
+    def pose(self, parameters: Parameters) -> CameraPose:
+        """The camera's pose at a puller with these parameters: the file's, and the usual one for what it leaves out."""
+        given = {name: getattr(self, name) for name in CameraPose._fields}
+        return pose_for(parameters)._replace(**{name: value for name, value in given.items() if value is not None})
 
     @property
     def pull_room(self) -> float:
@@ -355,5 +373,5 @@ def _shown(value: Any, size: float) -> str:
     return f"[{', '.join(texts)}]" if listed else texts[0]
 
 
-DEFAULT = PullerFile()
+DEFAULT = PullerFile(**CameraPose()._asdict())
 """The puller that was invented for this project: that of every environment without another one."""

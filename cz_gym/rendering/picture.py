@@ -15,7 +15,7 @@ from gymnasium.error import DependencyNotInstalled, Error, ResetNeeded
 
 from cz_gym.body.process import BODY
 from cz_gym.config import Config
-from cz_gym.crystal import recipe
+from cz_gym.crystal import recipe, sight
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.physics.meniscus import MeniscusModel, profile, profile_scale
 from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, Puller
@@ -113,11 +113,23 @@ class Record:
         return np.where(self.column("valid") > 0.0, radius, np.nan) - self.column("r_ref")
 
     @property
+    def camera_sees(self) -> str:
+        """What the camera reads now: "ring", "edge", or "" where nothing."""
+        return "ring" if self.last("valid") > 0.0 else ""
+
+    @property
     def length(self) -> Floats:
         """Length grown at every sample since the record began [m]: what was pulled less what the meniscus rose."""
         pulled: Floats = np.cumsum(self.column("v_p")) - self.column("v_p")[0]
         length: Floats = pulled * self.config.control_interval - (self.column("h_c") - self.column("h_c")[0])
         return length
+
+    def ring(self, z_b: float) -> tuple[float, float, str]:
+        """Distance from the axis and height above the melt [m] of the ring to be drawn, and its name.
+
+        That of a body is the effective point, at the height z_b [m], from which its reading follows: no camera's edge.
+        """
+        return self.last("r_br"), z_b, "effective ring"
 
     def surface(self, height: float = np.inf) -> tuple[Floats, Floats, Floats]:
         """The grown surface: radius, reference [m] and height above the melt [m], newest (lowest) first.
@@ -171,6 +183,25 @@ class CrystalRecord(Record):
     def lowest(self) -> float:
         """Lowest meniscus before it freezes [m]."""
         return recipe.HEIGHT_MIN
+
+    def ring(self, z_b: float) -> tuple[float, float, str]:
+        """Outer edge of the mirrored wall that this puller's camera sees, or where it sees none the crystal's edge."""
+        r_c, h_c = self.last("r_c"), max(self.last("h_c"), self.lowest)
+        if sight.shows_ring(r_c, h_c, self.puller):
+            edge = sight.ring_edge(r_c, h_c, self.puller)
+            return float(edge.r), float(edge.z), "bright ring"
+        return r_c, h_c, "no ring: edge"
+
+    @property
+    def camera_error(self) -> Floats:
+        """Radius error of every sample by ring or edge, whichever the camera reads [m]; NaN without a reading."""
+        edge = self.column("edge_measured") - self.column("r_ref")
+        return np.where(self.column("edge_valid") > 0.0, edge, super().camera_error)
+
+    @property
+    def camera_sees(self) -> str:
+        """What the camera reads now: "ring", "edge", or "" where nothing."""
+        return "edge" if self.last("edge_valid") > 0.0 else super().camera_sees
 
     @property
     def length(self) -> Floats:
@@ -242,7 +273,7 @@ def scale_of(box: Box, record: Record) -> Scale:
 def meniscus_curve(
     r_c: float, h_c: float, p: Puller, model: MeniscusModel, phi_b: float, lowest: float = HEIGHT_MIN
 ) -> tuple[Floats, Floats, float]:
-    """Radius and height [m] along Hurle's profile, from the triple point outwards, and the height of the bright ring.
+    """Radius and height [m] along Hurle's profile, from the triple point outwards, and the height of its ring.
 
     The profile is Hurle's whatever the model; its slope at the triple point is the model's own. Heights are clipped to
     their limits, as the ring of a failed state is measured.
@@ -278,7 +309,8 @@ def draw(canvas: Canvas, box: Box, record: Record) -> None:
         canvas.lines(palette.REFERENCE, scale.x(np.r_[r_ref[0], r_ref]), scale.y(np.r_[0.0, z]), 0.8)
         canvas.lines(palette.TRUE, x, y, 2.2)
         if not detached:
-            _draw_ring(canvas, box, scale, (scale.x(record.last("r_br")), scale.y(z_b)), (out[0], down[0]))
+            ring, height, words = record.ring(z_b)
+            _draw_ring(canvas, box, scale, (scale.x(ring), scale.y(height)), (out[0], down[0]), words)
         canvas.dot(palette.INK, x[0], y[0], 3.2)
         canvas.dot(palette.TRUE, x[0], y[0], 2.2)
     _draw_axis(canvas, box, scale)
@@ -287,14 +319,16 @@ def draw(canvas: Canvas, box: Box, record: Record) -> None:
     canvas.text(scale.x(r_ref[-1]) + 5, box.y + 30, "reference")
 
 
-def _draw_ring(canvas: Canvas, box: Box, scale: Scale, ring: tuple[float, float], edge: tuple[float, float]) -> None:
+def _draw_ring(
+    canvas: Canvas, box: Box, scale: Scale, ring: tuple[float, float], edge: tuple[float, float], words: str
+) -> None:
     """The bright ring, and vertical marks of its radius and the crystal's; pixels of both."""
     x, bottom = ring[0], box.bottom - 21
     canvas.dot(palette.CAMERA, *ring, 3.2)
     canvas.lines(palette.CAMERA, x, [ring[1], bottom])
     canvas.lines(EDGE_MARK, edge[0], [edge[1], bottom])
     room, anchor = (5, 0.0) if x + 64 < box.right else (-5, 1.0)
-    canvas.text(x + room, scale.y_0 + 8, "bright ring", palette.ON_MELT, 9.5, anchor, True)
+    canvas.text(x + room, scale.y_0 + 8, words, palette.ON_MELT, 9.5, anchor, True)
     canvas.text(edge[0] - 5, scale.y_0 + 8, "r_c", EDGE_MARK, 9.5, 1.0, True)
 
 
@@ -349,7 +383,7 @@ def _draw_header(canvas: Canvas, record: Record) -> None:
         canvas.text(x, 10, name, palette.FAINT, 11)
         canvas.text(x + 42, 7.5, value, size=13, bold=True)
     status, colour = ("growing", palette.WELL) if record.ending is None else ("ended", palette.ALARM)
-    if record.ending is None and record.last("valid") <= 0.0:
+    if record.ending is None and not record.camera_sees:
         status, colour = "camera: no reading", palette.CAMERA
     canvas.text(canvas.box.right - 10, 10, status, colour, 11, 1.0, True)
 
@@ -357,9 +391,9 @@ def _draw_header(canvas: Canvas, record: Record) -> None:
 def numbers(record: Record) -> list[list[tuple[str, str, Colour]]]:
     """Names, values and colours for a record's newest sample: of each group a signal, then its reference."""
     last, (v_p, Q_H, T_b) = record.last, record.nominal
-    radius = record.camera_error[-1] + last("r_ref")
+    radius, sees = record.camera_error[-1] + last("r_ref"), record.camera_sees
     return [
-        [("by the camera", f"{radius / MM:.2f} mm" if np.isfinite(radius) else "no reading", palette.CAMERA),
+        [(f"by the {sees or 'camera'}", f"{radius / MM:.2f} mm" if sees else "no reading", palette.CAMERA),
          ("reference", f"{last('r_ref') / MM:.2f}", palette.REFERENCE)],
         [("pull speed", f"{last('v_p') / MM_PER_MIN:.2f} mm/min", palette.DRIVE),
          ("nominal", f"{v_p / MM_PER_MIN:.2f}", palette.FAINT)],

@@ -13,7 +13,7 @@ from cz_gym.body.process import STATES, linearise, radius_model
 from cz_gym.camera.image import wall_edge
 from cz_gym.camera.view import camera_for, make_scene, make_view
 from cz_gym.config import make_config
-from cz_gym.crystal import recipe
+from cz_gym.crystal import recipe, sight
 from cz_gym.crystal.plant import complete
 from cz_gym.crystal.process import lengths, nominal_recipe
 from cz_gym.episodes.draw import Episode
@@ -57,11 +57,11 @@ def implied(puller: PullerFile) -> dict[str, str]:
 
 
 def _ring_exists(puller: PullerFile) -> str:
-    """Say where along the crystal the meniscus is steep enough to mirror the crucible's wall into the default camera,
-    whose line of sight decides: in a body, along its recipe, and down to which height of the meniscus.
+    """Say where along the crystal the meniscus is steep enough to mirror the crucible's wall into the file's camera: in
+    a body, along its recipe, and down to which height of the meniscus.
     """
     q, p = puller.parameters, make_puller(puller.parameters)
-    view = make_view(camera_for(q))
+    view = make_view(camera_for(q, puller.pose(q)))
 
     def needed(r_c: float, h_c: float) -> float:
         return wall_edge(make_scene(r_c, h_c, p), view).slope
@@ -81,7 +81,7 @@ def _ring_exists(puller: PullerFile) -> str:
     rows = slice(recipe.MARGIN, recipe.ROWS - recipe.MARGIN, 3)
     along, heights = lengths(constants)[rows], table[rows, recipe.RecipeRow._fields.index("h_c")]
     radii = [float(recipe.shape_at(L, constants, Episode()).r) for L in along]
-    seen = [not math.isnan(needed(r_c, float(h_c))) for r_c, h_c in zip(radii, heights, strict=True)]
+    seen = [bool(sight.shows_ring(r_c, float(h_c), constants)) for r_c, h_c in zip(radii, heights, strict=True)]
     ends = np.flatnonzero(np.diff(np.concatenate([[0], seen, [0]])))
     parts = ", ".join(f"{along[a] / MM:.0f} to {along[b - 1] / MM:.0f}" for a, b in ends.reshape(-1, 2))
     return f"{text}; along its recipe's crystal at {parts or 'no'} mm"

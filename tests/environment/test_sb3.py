@@ -223,7 +223,7 @@ def test_an_estimate_is_fitted_to_the_state_and_not_to_the_reward():
 
 def test_the_environment_is_named():
     env = make_vec_env(2, env="CzCrystal-v0", stage="tail", critic_state=True)
-    assert env.reset().shape == (2, 78 + 21)
+    assert env.reset().shape == (2, 95 + 21)
     assert env.get_attr("config")[0].process.name == "CzCrystal-v0"
     env.close()
     with pytest.raises(CzError, match="unknown environment 'CzCrystal': did you mean 'CzCrystal-v0'"):
