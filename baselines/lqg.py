@@ -214,6 +214,7 @@ class LQG(MeasuredController):
     """The LQG of the nominal puller; with ``hypotheses``, one that estimates the strength of the fluctuations."""
 
     accepts_missing_temperature: ClassVar[bool] = True
+    observes: ClassVar[bool] = True
 
     design: LQGDesign = LQGDesign()
     hypotheses: Hypotheses | None = None

@@ -103,6 +103,8 @@ class MeasuredController(ABC):
     """Meaning of its actions."""
     accepts_missing_temperature: ClassVar[bool] = False
     """Receives missing pyrometer readings as NaN, and not as the last reading."""
+    observes: ClassVar[bool] = False
+    """Memory follows the crystal also while another controller sets the drives, as a filter's does."""
 
     control_interval: float = 5.0
     """Time between actions [s]."""

@@ -126,6 +126,7 @@ FAULTS = {
     "ring steps by +2 mm": Fault(ring=lambda true, last: true + 2.0),
     "ring steps by -2 mm": Fault(ring=lambda true, last: true - 2.0),
     "ring stuck for 10 min": Fault(ring=lambda true, last: last, ring_ends=STEP + 10.0 * MINUTE),
+    "ring stuck for 30 min": Fault(ring=lambda true, last: last, ring_ends=STEP + 30.0 * MINUTE),
     "pyrometer drifts by -2 K/h": Fault(drift=-2.0),
     "pyrometer drifts by -4 K/h": Fault(drift=-4.0),
 }
@@ -139,6 +140,7 @@ class Faulty:
         self.off = {name: block.ports[name].default + fault.off * most for name, most in OFF.items()}
         self.latency = max(each.sensor.latency for each in block.config.scenario.scenarios)
         self.time, self.calls, self.due, self.bits = 0.0, 0, 0.0, 0
+        self.limited = list[float]()
         self.seen: Any = 0.0
         self.ring: Any = 0.0
         self.past = list[Any]()
@@ -175,7 +177,9 @@ class Faulty:
             self.ring = inputs["ring_radius_mm"]
         outputs, memory = self.runner.run(given, memory)
         if time > SETTLED:
-            self.bits |= int(np.bitwise_or.reduce(outputs["alarms"].astype(np.int64)))
+            alarms = outputs["alarms"].astype(np.int64)
+            self.bits |= int(np.bitwise_or.reduce(alarms))
+            self.limited.append(float(np.mean(alarms & (Alarm.PULL_LIMITED | Alarm.HEATER_LIMITED) > 0)))
         if not (self.fault.still and STILL[0] <= time < STILL[1]):
             self.held = outputs
         return self.held, memory
@@ -190,6 +194,8 @@ class Row(NamedTuple):
     helpless: int
     """Number of them that were lost while the drives stood still."""
     alarms: Alarm
+    limited: float
+    """Share of the time in which a drive counts as limited [-]."""
 
 
 def grow(block: Block, fault: str, crystals: int, runner: Runner | None = None, horizon: float = 3.0 * HOUR) -> Row:
@@ -201,7 +207,8 @@ def grow(block: Block, fault: str, crystals: int, runner: Runner | None = None, 
     error = (run.signals.r_c - run.signals.r_ref)[round(SETTLED / interval) :, ~run.failed] / MM
     ends = run.alive.sum(axis=0)[run.failed] * interval
     helpless = (ends > STILL[0]) & (ends <= STILL[1]) & FAULTS[fault].still
-    return Row(float(np.sqrt(np.mean(np.square(error)))), len(ends), int(helpless.sum()), Alarm(faulty.bits))
+    rmse, limited = float(np.sqrt(np.mean(np.square(error)))), float(np.mean(faulty.limited))
+    return Row(rmse, len(ends), int(helpless.sum()), Alarm(faulty.bits), limited)
 
 
 def report(rows: Mapping[tuple[str, str], Row], crystals: int) -> str:
@@ -211,12 +218,13 @@ def report(rows: Mapping[tuple[str, str], Row], crystals: int) -> str:
         share = row.rmse / rows[controller, "none"].rmse
         lost = f"{row.lost} ({row.helpless})" if row.helpless else str(row.lost)
         names = ", ".join(bit.name or "" for bit in row.alarms)
-        lines.append((controller, fault, f"{row.rmse:.3f}", f"{share:.2f}", lost, names))
-    heads = "controller", "fault", "RMSE [mm]", "of none", "lost", "alarms"
+        lines.append((controller, fault, f"{row.rmse:.3f}", f"{share:.2f}", lost, f"{row.limited:.1%}", names))
+    heads = "controller", "fault", "RMSE [mm]", "of none", "lost", "limited", "alarms"
     return f"""# Blocks under the faults of a plant
 
 {crystals} test crystals of three hours each, errors from half an hour on, of those that were kept. In brackets: those
-of the lost that were lost while the drives stood still, when no block acts.
+of the lost that were lost while the drives stood still, when no block acts. Limited: share of the time with a bit that
+says so.
 
 {markdown(heads, lines)}
 """

@@ -162,7 +162,7 @@ def settings_of(config: Config, puller: Puller | None = None) -> tuple[Port, ...
         Port("gap_s", "time without a call after which the next one is a takeover", max(10.0 * interval, 30.0)),
         Port("return_after_s", "time of good readings near nominal after which a PID gives way; 0: never", 1200.0),
         Port("ring_step_mm", "change of the ring that no crystal makes in a sample", step),
-        Port("ring_still_s", "time after which a ring that does not change counts as stuck", 120.0),
+        Port("ring_still_s", "time after which a ring that does not change counts as stuck", 60.0),
         Port("radius_limit_mm", "distance of the ring from its reference that raises a bit", config.puller.scale),
         Port("radius_limit_s", "time after which it does", 600.0),
     )

@@ -95,7 +95,7 @@ class AgentMemory(NamedTuple):
 class Agent:
     """A trained agent as a controller of the shell."""
 
-    accepts_missing_temperature = False
+    accepts_missing_temperature, observes = False, True
 
     def __init__(self, policy: Any, config: Config) -> None:
         contract, ranges = policy.contract, config.ranges

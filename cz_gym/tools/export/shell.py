@@ -4,7 +4,7 @@ The controller runs on a grid of its own interval. A call makes as many samples 
 :data:`PASSES` of them; after a gap it is a takeover. Readings that are not finite, invalid, too old, outside the range
 of the observations, or of a pyrometer that jumps or stands still are replaced by the last good ones. If that lasts, if
 the controller's output is not finite, or if its model does not explain the readings, the fallback PID takes over until
-the next takeover; without a ring it holds the pull speed, without a pyrometer the heater follows the recipe and the
+the next takeover; without a ring the pull speed is nominal, without a pyrometer the heater follows the recipe and the
 pull speed alone. After every takeover the setpoints start at the applied drives and move to the controller's within
 ``takeover_s``. All of it is NumPy code on arrays of shape (n,): :meth:`Block.run` runs it on n plants at once, and
 :attr:`Block.program` is its record, from which other languages are written.
@@ -51,6 +51,8 @@ from .trace import PASSES, Floats, Port, Program, record
 
 NO_PYROMETER_TIME = MINUTE
 """Time for which a controller that estimates the temperature keeps the heater without a pyrometer [s]."""
+NO_RING_TIME = 15.0
+"""Time without a ring after which a controller that does not observe gives the pull speed to its nominal value [s]."""
 DRIVE_ERROR_TIME = MINUTE
 """Time after which a drive counts as not following [s]."""
 PULL_BIAS_TIME, TRIM_T_1, TRIM_Q_H = 5.0 * MINUTE, 0.5, 0.005
@@ -80,6 +82,11 @@ class Controller(Protocol):
     @property
     def accepts_missing_temperature(self) -> bool:
         """Whether the controller estimates the temperature, and so gets an infinite reading of a bad pyrometer."""
+
+    @property
+    def observes(self) -> bool:
+        """True if its memory follows the crystal also while another controller or a hold sets the drives, as that of a
+        filter or of a trained agent does. Else it begins anew when the fallback gives way."""
 
     def at_rest(self, seen: Measured) -> Any:
         """The controller's memory before the first sample."""
@@ -145,7 +152,8 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     estimates = controller.accepts_missing_temperature
     # The samples of a call have one frame in common, whose noise counts once.
     told = read._replace(T_1=np.where(call.again, np.inf, seen.T_1 - T_1_offset), valid=read.valid / call.samples)
-    goes_on = runs & ~returns & ~corrects
+    observes = controller.observes
+    goes_on = runs & ~corrects & (True if observes else ~returns)
     held = memory.controller if goes_on.all() else select(goes_on, memory.controller, controller.at_rest(read))
     own = controller.step(told if estimates else read, held)
     other = own[0], own[1], memory.pid
@@ -162,7 +170,9 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     blind = ~seen.pyrometer & ((no_pyrometer_time > NO_PYROMETER_TIME) | fallback | (not estimates))
     moved = np.where(seen.reference & ~call.starts, seen.read.T_1_ref - memory.readings.T_1_ref, 0.0)
     trim = FOLLOWED * constants.feed * moved + constants.trim * (bias - memory.pull_bias + dt / constants.slow * bias)
-    wanted = np.where(fallback & ~seen.ring.good, old[0], pull), np.where(blind, old[1] + trim / KILO, heater)
+    # Any other pull than the mean one grows into the radius unseen, and the last one is none.
+    no_ring = ~seen.ring.good & (fallback | (False if observes else memory.no_ring_time > NO_RING_TIME))
+    wanted = np.where(no_ring, nominal[0], pull), np.where(blind, old[1] + trim / KILO, heater)
     sound = finite(wanted[0]) & finite(wanted[1])
     moves = [
         each.move(start, np.where(sound, target, start), authority, dt)

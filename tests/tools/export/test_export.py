@@ -275,6 +275,16 @@ def test_readings_that_err_cost_no_radius(fault):
     assert row.rmse < 1.2 * exact.rmse
 
 
+@needs_compiler
+def test_a_stuck_ring_costs_no_crystal_and_its_controller_comes_back_without_a_bump():
+    """A filter follows the crystal while the PID controls; one that began anew would take the heater for wrong."""
+    block = block_of("lqg-at-0.02")
+    row = grow(block, "ring stuck for 10 min", 8, CompiledBlock(block), 7200.0)
+    assert row.lost == 0
+    assert Alarm.RING | Alarm.FALLBACK in row.alarms
+    assert Alarm.HEATER_LIMITED not in row.alarms
+
+
 def test_a_shadow_runs_beside_a_log(tmp_path):
     env = CzEnv("puller", observation="measured", action="direct", info="all", horizon=3600.0)
     record_log(env, make_controller("paper-tuned", env.config), tmp_path / "log.csv", seed=1)
@@ -385,7 +395,8 @@ def test_the_samples_of_a_late_call_see_ring_and_drives_on_their_way():
     block, told = block_of("lqg"), []
 
     class Spy:
-        accepts_missing_temperature, at_rest = True, block.controller.at_rest
+        accepts_missing_temperature = observes = True
+        at_rest = block.controller.at_rest
 
         def step(self, seen, memory):
             told.append([float(value[0]) for value in (seen.ring_error, seen.v_p, seen.Q_H, seen.T_1, seen.valid)])
