@@ -19,6 +19,7 @@ from scipy.signal import cont2discrete
 from cz_gym.body.process import radius_model
 from cz_gym.body.signals import PREVIEWS, Measured
 from cz_gym.physics.plant import make_puller
+from cz_gym.support.errors import CzError
 from cz_gym.support.units import KILO
 
 from .policy import Floats, MeasuredController, check_numbers
@@ -62,6 +63,47 @@ class SeriesPID:
         lead = b_0 * error + state.lead_in
         integral = state.integral + 0.5 * dt / self.T_i * (state.lead_out + lead)
         return self.K_p * (lead + integral), PIDState(b_1 * error - a_1 * lead, lead, integral)
+
+
+class StandardPID(NamedTuple):
+    """The same law as u = gain (1 + 1/(T_i s) + T_d s/(filter_share T_d s + 1)) e, the ISA form of most PLCs."""
+
+    gain: float
+    """[1/s]"""
+    T_i: float
+    """Integral time [s]."""
+    T_d: float
+    """Derivative time [s]."""
+    filter_share: float
+    """Time constant of the derivative's filter, in shares of T_d [-]."""
+
+    @classmethod
+    def of(cls, pid: SeriesPID) -> "StandardPID":
+        """The standard form of a series PID, by partial fractions: exact."""
+        filter_time = pid.T_d / pid.N
+        T_i = pid.T_i + pid.T_d - filter_time
+        gain = pid.K_p * T_i / pid.T_i
+        T_d = pid.K_p * pid.T_d / gain - filter_time
+        return cls(gain, T_i, T_d, filter_time / T_d if T_d else 0.0)
+
+    def series(self) -> SeriesPID:
+        """The series form; CzError if it has complex zeros, which no series PID has."""
+        filter_time = self.filter_share * self.T_d
+        total, product = self.T_i + filter_time, self.T_i * (self.T_d + filter_time)
+        if total**2 < 4.0 * product:
+            raise CzError("this PID has complex zeros: it has no series form")
+        T_i = 0.5 * (total + math.sqrt(total**2 - 4.0 * product))
+        T_d = total - T_i
+        return SeriesPID(self.gain * T_i / self.T_i, T_i, T_d, T_d / filter_time if filter_time else 100.0)
+
+    def parallel(self) -> tuple[float, float, float]:
+        """Gains of the parallel form P + I/s + D s/(filter s + 1): [1/s], [1/s2], [-]."""
+        return self.gain, self.gain / self.T_i, self.gain * self.T_d
+
+    @classmethod
+    def from_parallel(cls, P: float, I: float, D: float, filter_time: float) -> "StandardPID":
+        """The standard form of a parallel one with a derivative filter [s]."""
+        return cls(P, P / I, D / P, filter_time * P / D if D else 0.0)
 
 
 @dataclass(frozen=True)

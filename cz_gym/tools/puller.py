@@ -4,20 +4,27 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
+from cz_gym.baselines.fallback import fallback
 from cz_gym.baselines.margins import EXPLAINED, HEADS, shown
+from cz_gym.baselines.pid import StandardPID
 from cz_gym.baselines.tuned_controllers import LQGS, PIDS
 from cz_gym.body.process import STATES, linearise, radius_model
 from cz_gym.camera.image import wall_edge
 from cz_gym.camera.view import camera_for, make_scene, make_view
-from cz_gym.config import make_config
+from cz_gym.config import Config, make_config
 from cz_gym.crystal import recipe, sight
 from cz_gym.crystal.plant import complete
 from cz_gym.crystal.process import lengths, nominal_recipe
 from cz_gym.episodes.draw import Episode
 from cz_gym.episodes.scenarios import RANDOMIZED
+from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.protocol import VALIDATION_SEEDS
+from cz_gym.evaluation.rollout import rollout
+from cz_gym.evaluation.statistics import Resamples, means
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.parameters import MACHINE, Parameters
 from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, make_puller
@@ -110,15 +117,62 @@ def margins(puller: PullerFile) -> str:
     return f"{markdown(('controller', *HEADS), rows)}\n\n{EXPLAINED}"
 
 
+CRYSTALS = 20
+"""Validation crystals of a prediction."""
+
+
+def pid_numbers(puller: PullerFile) -> str:
+    """Numbers of the PIDs that are searched for a puller, in the forms of control computers, as a table."""
+    config = make_config(RANDOMIZED, observation="measured", action="direct", puller=puller)
+    named = [(each.name, each.make(config)) for each in PIDS if each.near] + [("fallback", fallback(config).pid)]
+    columns = [{"": name} | _numbers_of(controller, config) for name, controller in named]
+    rows = [[head, *(column[head] for column in columns)] for head in list(columns[0])[1:]]
+    return markdown(("", *(name for name, _ in named)), rows)
+
+
+def _numbers_of(controller: Any, config: Config) -> dict[str, str]:
+    """One PID by the names of its numbers."""
+    form, compensator = StandardPID.of(controller.pid), controller.compensator
+    P, I, D = form.parallel()
+    error = metrics(rollout(controller, config, VALIDATION_SEEDS[:CRYSTALS])).rmse_mm
+    (mean,) = means(error[None, :, None], Resamples.draw(CRYSTALS))
+    pull = config.puller.pull_room
+    reach = min(pull, config.parameters.v_0)
+    ends = (f"{(config.parameters.v_0 + end) / (MM / HOUR):.4g}" for end in (-reach, reach))
+    time = form.filter_share * form.T_d
+    per_diameter = 0.5 * HOUR * form.gain
+    return {
+        "ISA: gain [mm/min per mm of radius]": f"{form.gain * MINUTE:.5g}",
+        "ISA: T_i [s], T_d [s]": f"{form.T_i:.5g}, {form.T_d:.5g}",
+        "parallel: P [1/s], I [1/s2], D [-]": f"{P:.5g}, {I:.5g}, {D:.5g}",
+        "parallel: filter of D [s]": f"{time:.4g}",
+        "panel: diameter gain [mm/h per mm]": f"{per_diameter:.5g}",
+        "panel: integral [1/min], derivative [min]": f"{MINUTE / form.T_i:.5g}, {form.T_d / MINUTE:.5g}",
+        "panel: limits of the lift [mm/h]": " to ".join(ends),
+        "PID_Compact: Gain, Ti [s], Td [s]": f"{form.gain * MINUTE:.5g}, {form.T_i:.5g}, {form.T_d:.5g}",
+        "PID_Compact: TdFiltRatio; PWeighting, DWeighting": f"{form.filter_share:.4g}; 1, 1",
+        "before it: filter of the ring [s]": f"{controller.T_f:.4g}",
+        "before it: compensator": "none"
+        if compensator is None
+        else f"{compensator.gain:.5g} s / ((s + "
+        f"{compensator.fast:.4g})(s + {compensator.slow:.4g})) from the pull speed",
+        f"predicted RMSE [mm], {CRYSTALS} crystals, 95 %": mean.text(".3f"),
+    }
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser("cz-gym puller", "Print what a puller file implies.")
     parser.add_argument("puller", metavar="FILE.toml", help="puller file, or the name of a shipped one")
+    parser.add_argument("--pid", action="store_true", help="print PIDs in the forms of control computers, and no more")
     return parser.run(_main, arguments, "plant", "nothing printed")
 
 
 def _main(given: argparse.Namespace) -> None:
     puller = find_puller(given.puller)
+    if given.pid:
+        print(f"puller {puller.label}\n\n{pid_numbers(puller)}")
+        return
     taken, sizes = defaults_of(puller), {each.key: each.size for each in MACHINE.values()}
     lines = implied(puller) | {
         "as the default": ", ".join(f"{key} = {value / sizes[key]:.10g}" for key, value in taken.items()),

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from cz_gym import make_puller
 from cz_gym.baselines.analysis import linear_form, loop_margins
-from cz_gym.baselines.pid import CompensatedPID, Compensator, FilteredPID, SeriesPID, TemperatureLoop
+from cz_gym.baselines.pid import CompensatedPID, Compensator, FilteredPID, SeriesPID, StandardPID, TemperatureLoop
 from cz_gym.baselines.policy import DriveLimits
 from cz_gym.baselines.tuned import TUNED
 from cz_gym.baselines.tuned_controllers import PIDS, below_half_the_zero
@@ -23,6 +23,7 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.parameters import Parameters
 from cz_gym.process import PULL_SCALE
 from cz_gym.spaces import HEATER_RANGE, MEASURED
+from cz_gym.support.errors import CzError
 from cz_gym.support.units import MM, MM_PER_MIN
 from tests.observed import PLAIN, measured, pulls
 
@@ -189,3 +190,25 @@ def test_papers_ramp_peaks_where_the_printed_controller_puts_it(model, dt, peak_
     assert np.abs(true).max() / MM == pytest.approx(peak_mm, rel=0.03)
     compensated = ring - make_puller().ring_bias + Compensator().respond(run.signals.v_p[:, 0] - V_0, dt)
     assert np.abs(compensated).max() < 0.5 * np.abs(true).max(), "the compensated ring shows less than half of it"
+
+
+@pytest.mark.parametrize("pid", [SeriesPID(), SeriesPID(2e-3, 12_500.0, 560.0, 20.0), SeriesPID(0.004, 900.0, 0.0)])
+def test_every_form_of_a_pid_converts_back_to_the_same_controller(pid):
+    """The ISA, the parallel and PID_Compact's form have the series PID's response at every frequency."""
+    form = StandardPID.of(pid)
+    P, I, D = form.parallel()
+    for back in (form.series(), StandardPID.from_parallel(P, I, D, form.filter_share * form.T_d).series()):
+        assert [back.K_p, back.T_i, back.T_d] == pytest.approx([pid.K_p, pid.T_i, pid.T_d], rel=1e-9)
+        assert pid.T_d / back.N == pytest.approx(pid.T_d / pid.N, rel=1e-9)
+    s = 1j * np.geomspace(1e-5, 1.0, 50)
+    series = pid.K_p * (1.0 + 1.0 / (pid.T_i * s)) * (pid.T_d * s + 1.0) / (pid.T_d / pid.N * s + 1.0)
+    a, T_d = form.filter_share, form.T_d
+    compact = form.gain * (1.0 + 1.0 / (form.T_i * s) + T_d * s / (a * T_d * s + 1.0))
+    parallel = P + I / s + D * s / (a * T_d * s + 1.0)
+    assert compact == pytest.approx(series, rel=1e-9)
+    assert parallel == pytest.approx(series, rel=1e-9)
+
+
+def test_a_pid_with_complex_zeros_has_no_series_form():
+    with pytest.raises(CzError, match="complex zeros"):
+        StandardPID(1.0, 100.0, 100.0, 0.1).series()
