@@ -17,6 +17,7 @@ from cz_gym.body.process import BODY
 from cz_gym.config import Config
 from cz_gym.crystal import recipe, sight
 from cz_gym.crystal.process import CRYSTAL
+from cz_gym.episodes.draw import Episode
 from cz_gym.physics.meniscus import MeniscusModel, profile, profile_scale
 from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, Puller
 from cz_gym.process import Process
@@ -53,6 +54,7 @@ class Record:
     def __init__(self, config: Config, slot: Any, scenario: str) -> None:
         self.config, self.scenario = config, scenario
         self.puller = config.process.Constants(*slot["puller"].tolist())
+        self.episode = Episode(*slot["episode"].tolist())
         self.ending: Ending | None = None
         """How the episode ended; None while it goes on."""
         self._first = int(slot["k"])

@@ -45,24 +45,27 @@ def test_measured_holds_what_the_control_computer_has_and_nothing_else(scenario)
     rows, infos, start = run(env, 400, 0.05)
     p = start.slot["puller"]
     nominal = {name: float(p[name]) for name in ("r_0", "v_0", "T_1_0", "Q_H_0", "ring_bias")}
+    e = fields(start.slot["episode"])
+    told = {"T_1_0": nominal["T_1_0"] + e.told_temperature, "Q_H_0": nominal["Q_H_0"] + e.told_power}
     seen = decode(rows)
     ring = column(infos, "r_br_measured") - nominal["ring_bias"]
     np.testing.assert_allclose(seen.ring_error, ring - column(infos, "r_ref"), atol=1e-9)
     np.testing.assert_allclose(seen.r_ref, column(infos, "r_ref") - nominal["r_0"], atol=1e-9)
-    np.testing.assert_allclose(seen.T_1_ref, column(infos, "T_1_ref") - nominal["T_1_0"], atol=1e-5)
-    np.testing.assert_allclose(seen.v_p, column(infos, "v_p") - nominal["v_0"], atol=1e-11)
-    np.testing.assert_allclose(seen.Q_H, column(infos, "Q_H") - nominal["Q_H_0"], atol=1e-2)
+    np.testing.assert_allclose(seen.T_1_ref, column(infos, "T_1_ref") - told["T_1_0"], atol=1e-5)
+    np.testing.assert_allclose(seen.v_p, e.pull_scale * column(infos, "v_p") - nominal["v_0"], atol=1e-11)
+    np.testing.assert_allclose(seen.Q_H, e.heater_scale * column(infos, "Q_H") - told["Q_H_0"], atol=1e-2)
+    assert (told["Q_H_0"] != nominal["Q_H_0"] and e.heater_scale != 1.0) is (scenario == "puller")
     mean, means = 0.0, [0.0]
     for v_p in column(infos, "v_p")[1:] - nominal["v_0"]:
         mean = math.exp(-5.0 / 1800.0) * mean + (1.0 - math.exp(-5.0 / 1800.0)) * v_p
         means.append(mean)
     np.testing.assert_allclose(column(infos, "v_p_mean") - nominal["v_0"], means, atol=1e-17)
-    np.testing.assert_allclose(seen.v_p_mean, means, rtol=1e-6, atol=1e-15)
+    read = e.pull_scale * (np.array(means) + nominal["v_0"]) - nominal["v_0"]
+    np.testing.assert_allclose(seen.v_p_mean, read, rtol=1e-6, atol=1e-15)
     assert np.ptp(means) > 1e-3 * nominal["v_0"]
     t = 5.0 * np.arange(401)
-    e = fields(start.slot["episode"])
     drift = np.array([pyrometer_drift(now, e) for now in t])
-    pyrometer = column(infos, "T_1") + drift + drawn(env).noise[:401, 1] - nominal["T_1_0"]
+    pyrometer = column(infos, "T_1") + drift + drawn(env).noise[:401, 1] - told["T_1_0"]
     np.testing.assert_allclose(seen.T_1, pyrometer, atol=1e-5)
     assert set(np.unique(seen.valid)) <= {0.0, 1.0}
 

@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
+from cz_gym.baselines.clairvoyant import episodes_of
 from cz_gym.config import make_config
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
@@ -36,7 +37,9 @@ def test_the_loop_over_opc_ua_is_the_loop_in_python(name, scenario, options, ste
     found = np.stack([rows[name] for name in shown], axis=-1)
     config = make_config(scenario, observation="measured", action="direct", horizon=steps * 5.0)
     s = rollout(BlockPolicy(make_block(name, config)), config, [1]).signals
-    twin = np.concatenate([s.r_br_measured / MM, s.v_p / MM_PER_MIN, s.Q_H / KILO], axis=-1)
+    (e,) = episodes_of(config, [1])  # its drives are read with these errors
+    read = e.pull_scale * s.v_p / MM_PER_MIN, e.heater_scale * s.Q_H / KILO
+    twin = np.concatenate([s.r_br_measured / MM, *read], axis=-1)
     assert len(found) >= steps - 1
     np.testing.assert_allclose(found, twin[: len(found)], rtol=0, atol=5e-6)
 

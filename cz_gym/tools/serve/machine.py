@@ -228,7 +228,9 @@ class Machine:
         self._observation, _ = self.env.reset(seed=seed, options=saved and {"state": saved.env})
         self._record: Any = record_of(self.env)
         self._log, self._state, self._lock = log, state, threading.RLock()
-        self.puller = self._record.puller
+        own, told = self._record.puller, self._record.episode
+        self.puller = own._replace(Q_H_0=own.Q_H_0 + told.told_power, T_1_0=own.T_1_0 + told.told_temperature)
+        """Its constants, with the nominal values that controllers are told."""
         self._fallback = self._make_fallback()
         self._memory = self._rest()
         self._fixed = self._settings()
@@ -489,7 +491,7 @@ class CrystalMachine(Machine):
 
     def _settings(self) -> dict[str, Any]:
         """Those of ``Cz-v0``, with the least and the largest drives that the recipe and their ranges allow."""
-        drives = self._record.table[:, [_v_p, _Q_H]] / (MM_PER_MIN, KILO)
+        drives = (self._record.table[:, [_v_p, _Q_H]] + (0.0, self._record.episode.told_power)) / (MM_PER_MIN, KILO)
         reach = np.minimum(self._units, (self.config.puller.pull_room / MM_PER_MIN, np.inf))
         limits = np.maximum(drives.min(axis=0) - reach, 0.0), drives.max(axis=0) + reach
         names = [name.replace("setpoint", end) for end in ("min", "max") for name in SETPOINT_NAMES]
