@@ -15,8 +15,11 @@ from threading import Timer
 COMMANDS = {
     "train": ("cz_gym.tools.train", "train an agent by a recipe"),
     "benchmark": ("cz_gym.tools.benchmark", "compare controllers and agents on the same crystals"),
+    "check": ("cz_gym.tools.check", "check an agent or a controller before a run"),
+    "leaderboard": ("cz_gym.tools.leaderboard", "run submitted agents again on fresh crystals"),
     "tune": ("cz_gym.tools.tune", "search settings of controllers, or design them for a puller"),
     "identify": ("cz_gym.tools.identify.command", "estimate a puller's numbers from its log"),
+    "bode": ("cz_gym.tools.bode", "margins and Bode plot of a controller's loop"),
     "puller": ("cz_gym.tools.puller", "print what a puller file implies"),
     "recipe": ("cz_gym.tools.recipe", "set points of a whole crystal against its length"),
     "export": ("cz_gym.tools.export.command", "write a controller or agent as code for a PLC"),
@@ -30,7 +33,7 @@ SOON = 0.5
 HELP = "\n".join([
     "usage: cz-gym COMMAND ...; cz-gym COMMAND --help has its options",
     "",
-    *(f"  {name:10} {about}" for name, (_, about) in COMMANDS.items()),
+    *(f"  {name:11} {about}" for name, (_, about) in COMMANDS.items()),
 ])  # fmt: skip
 
 

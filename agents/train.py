@@ -33,6 +33,7 @@ from stable_baselines3.common.utils import configure_logger
 from tqdm import tqdm
 
 from cz_gym.evaluation.parallel import run_parallel
+from cz_gym.evaluation.protocol import load_user_object
 from cz_gym.sb3 import environment_steps
 from cz_gym.support.errors import CzError, software
 from cz_gym.support.files import locked, write_files
@@ -148,6 +149,8 @@ class TrainingRun:
     """Longest time between checkpoints, apart from validations and updates in between [s]."""
     plot: bool = False
     """Whether to draw the progress into the folder."""
+    callbacks: tuple[str, ...] = ()
+    """Places FILE.py:NAME of the user's callbacks."""
     files: dict[str, bytes] = field(default_factory=dict, init=False, repr=False)
     """The run's other files as the next checkpoint holds them."""
     rows: list[dict[str, Any]] = field(default_factory=list, init=False, repr=False)
@@ -224,6 +227,7 @@ class TrainingRun:
             if self.steps < self.recipe.steps:
                 left = -(-(self.recipe.steps - self.steps) // repeat_of(self.recipe))
                 fits: list[BaseCallback] = [LearnState()] if isinstance(self.algorithm.policy, Asymmetric) else []
+                fits += map(load_callback, self.callbacks)
                 self.algorithm.learn(left, [*fits, _Watch(self, bar, interrupted)], reset_num_timesteps=False)
             if not self.rows or int(self.rows[-1]["steps"]) < self.steps:
                 self.validate(bar)
@@ -310,6 +314,19 @@ class TrainingRun:
             "plant_hash": self.recipe.config.plant_hash,
             "scenario_hash": self.recipe.config.scenario.hash,
         }
+
+
+def load_callback(place: str) -> BaseCallback:
+    """The callback at ``FILE.py:NAME``, made if that is a class or a function; CzError if it is none."""
+
+    def fits(value: Any, _: str) -> bool:
+        return isinstance(value, BaseCallback) or (isinstance(value, type) and issubclass(value, BaseCallback))
+
+    _, found = load_user_object(place, "callback", fits)
+    made = found() if callable(found) else found
+    if not isinstance(made, BaseCallback):
+        raise CzError(f"{place}: no callback: a {type(made).__name__}, not a BaseCallback of stable-baselines3")
+    return made
 
 
 class _Watch(BaseCallback):

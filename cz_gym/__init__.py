@@ -32,10 +32,10 @@ from .vector_checker import check_vector_env
 
 
 def _beside(name: str, *_: object) -> ModuleSpec | None:
-    """Find ``cz_gym.agents`` and ``cz_gym.baselines`` in a clone, where they stand beside this folder."""
+    """Find ``cz_gym.agents``, ``baselines`` and ``examples`` in a clone, where they stand beside this folder."""
     package, own = name.partition(".")[::2]
     place = Path(__file__).parents[1] / own
-    if package != __name__ or own not in ("agents", "baselines") or not place.is_dir():
+    if package != __name__ or own not in ("agents", "baselines", "examples") or not place.is_dir():
         return None
     return spec_from_file_location(name, place / "__init__.py", submodule_search_locations=[str(place)])
 

@@ -50,7 +50,7 @@ def card(name: str, how: str, contracts: Sequence[Contract], estimates: pd.DataF
         [
             f"## `{name}`\n",
             f"- How it learned: {how}.",
-            f"- Saw: crystals of {first.scenario}; kept after {steps} million steps.",
+            f"- Declared: trained on crystals of {first.scenario}, kept after {steps} million steps.",
             f"- Reads: `{first.observation}`; acts every {first.control_interval:g} s; its action is `{first.action}`.",
             f"- Training seeds: {len(contracts)}. `agents.load({name!r})` is the one of least validation cost.",
             "- Fails: " + (f"loses crystals of {', '.join(fails)}." if fails else "on none of these."),
@@ -62,7 +62,8 @@ def card(name: str, how: str, contracts: Sequence[Contract], estimates: pd.DataF
 ABOUT = """# Model cards
 
 What each shipped agent saw, what it reaches and where it fails, on test crystals that took no part in its training. All
-training seeds of a name are pooled; in brackets the 95 % interval over crystals and training seeds. The figures are of
+training seeds of a name are pooled; in brackets the 95 % interval over crystals and training seeds. How an agent
+learned and in how many steps is declared by its maker, as of every agent; its figures are measured. They are of
 [the benchmark](../benchmark/report.md); `python -m studies.cards` wrote this page.
 
 No agent was trained or tested on a real puller: none may control one.

@@ -26,7 +26,7 @@ class StudyParser(OneLineParser):
         body: Callable[[argparse.Namespace], int | None],
         arguments: Sequence[str] | None,
         extra: str = "benchmark",
-        left: str = "nothing written",
+        left: str | Callable[[], str] = "nothing written",
     ) -> int:
         """Run the study if its results can be written; arguments and exit code as of :meth:`OneLineParser.run`."""
 

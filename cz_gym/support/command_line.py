@@ -50,7 +50,7 @@ class OneLineParser(argparse.ArgumentParser):
         body: Callable[[argparse.Namespace], int | None],
         arguments: Sequence[str] | None,
         extra: str,
-        left: str = "nothing written",
+        left: str | Callable[[], str] = "nothing written",
     ) -> int:
         """Parse the arguments and run the command's body on them (:func:`run_command`); return the exit code."""
         given = self.parse_args(arguments)
@@ -72,7 +72,9 @@ def between(least: int, most: int) -> Callable[[str], int]:
     return number
 
 
-def run_command(prog: str, body: Callable[[], int], extra: str, left: str = "nothing written") -> int:
+def run_command(
+    prog: str, body: Callable[[], int], extra: str, left: str | Callable[[], str] = "nothing written"
+) -> int:
     """Run a command's body and return its exit code.
 
     One line on stderr tells of a :class:`CzError`, a missing package of the project's extras, Ctrl-C, and of an output
@@ -107,7 +109,7 @@ def run_command(prog: str, body: Callable[[], int], extra: str, left: str = "not
         else:
             raise
     except KeyboardInterrupt:
-        print(f"{prog}: interrupted; {left}", file=sys.stderr)
+        print(f"{prog}: interrupted; {left if isinstance(left, str) else left()}", file=sys.stderr)
         return 130
     print(f"{prog}: {' '.join(message.split())}", file=sys.stderr)
     return 2

@@ -284,6 +284,7 @@ def _write_all(given: argparse.Namespace) -> None:
         for name in given.policies.split(",")
     ]
     one = partial(_write_one, datasets_root().absolute(), TRAINING_SEEDS[: given.episodes], given.noise, settings)
+    print(f"into {datasets_root().absolute()}", flush=True)
     on_cluster = run_parallel(one, tasks, None, given.cluster, datasets_root().absolute())
     for _, line in on_cluster if given.cluster else enumerate(map(one, tasks)):
         print(line, flush=True)

@@ -1,8 +1,10 @@
 """``cz-gym train``: train an agent by a recipe, or several training seeds in parallel."""
 
 import argparse
+import math
 import shlex
 from collections.abc import Sequence
+from dataclasses import fields as dataclass_fields
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ from cz_gym.config import check_config
 from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.puller.file import chosen_puller
 from cz_gym.support.command_line import OneLineParser, between, interpreter, run_command
-from cz_gym.support.errors import CzError
+from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.files import check_writable, locked
 
 from .registry import make_controller
@@ -38,6 +40,10 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     about = "what to train on: a scenario's name, all, FILE.py:NAME, or A=0.6,B=0.4 (default: as for --steps)"
     add("--scenario", help=about)
     parser.add_puller("train for it, at its control interval")
+    about = "field of the recipe with another value, as learning_rate=3e-4 or hidden=128,128 (cz_gym.agents.recipes)"
+    add("--set", action="append", default=[], metavar="FIELD=VALUE", help=about)
+    about = "callback of stable-baselines3, or a class or function that makes one: for instance a tracker's"
+    add("--callback", action="append", default=[], metavar="FILE.py:NAME", help=about)
     about = "run folder (default: runs/<algo>-seed<seed>; with --seeds runs/<algo>, with a folder for each seed)"
     add("--out", type=Path, help=about)
     parser.add_cluster()
@@ -60,8 +66,13 @@ def main(argv: Sequence[str]) -> int:
     """Train; returns 0 when done, 2 for bad input, 130 when interrupted."""
     arguments = parse(argv)
     words = ["-m", "cz_gym", "train", *(word for word in argv if word != "--resume"), "--resume"]
-    left = f"{shlex.join([interpreter(), *words])} continues from the last checkpoint"
     extras = "agents,benchmark" if arguments.plot else "agents"
+
+    def left() -> str:
+        if not any(arguments.out.glob("**/settings.json")):
+            return "nothing was kept yet"
+        return f"{shlex.join([interpreter(), *words])} continues from the last checkpoint"
+
     return run_command("cz-gym train", lambda: train(arguments), extras, left)
 
 
@@ -72,7 +83,7 @@ def train(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from cz_gym.agents.recipes import references
-    from cz_gym.agents.train import TrainingRun, train_seeds
+    from cz_gym.agents.train import TrainingRun, load_callback, train_seeds
 
     folders = [arguments.out.resolve() / f"seed{seed}" for seed in arguments.seeds or ()] or [arguments.out]
     recipe, seed = _recipe_and_seed(arguments, folders)
@@ -80,15 +91,18 @@ def train(arguments: argparse.Namespace) -> int:
     for folder in folders:
         with locked(folder):
             pass  # if another process has it, say so before the training
-    options = references(make_controller, recipe), arguments.checkpoint_seconds, arguments.plot
+    callbacks = tuple(map(_absolute, arguments.callback))
+    for place in callbacks:
+        load_callback(place)
     seeds = arguments.seeds or [seed]
-    runs = [TrainingRun(folder, recipe, seed, *options) for folder, seed in zip(folders, seeds, strict=True)]
-    amount = f"{len(runs)} seeds" if arguments.seeds else f"seed {seed}, {recipe.steps:,} steps"
+    amount = f"{len(seeds)} seeds" if arguments.seeds else f"seed {seed}, {recipe.steps:,} steps"
     machine = f", puller {recipe.config.puller.label}" if recipe.puller else ""
     if recipe.updates < FEW_UPDATES:
         print(f"{recipe.steps:,} steps are {recipe.updates} updates of {recipe.name}: too few to learn from")
     where = f"{recipe.environment} ({', '.join(recipe.stages)}), " if recipe.environment else ""
-    print(f"{recipe.name}, {amount} on {where}{recipe.config.scenario.name}{machine}, into {arguments.out}")
+    print(f"{recipe.name}, {amount} on {where}{recipe.config.scenario.name}{machine}, into {arguments.out}", flush=True)
+    options = references(make_controller, recipe), arguments.checkpoint_seconds, arguments.plot, callbacks
+    runs = [TrainingRun(folder, recipe, seed, *options) for folder, seed in zip(folders, seeds, strict=True)]
     if not arguments.seeds:
         with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, disable=None) as bar:
             summary = runs[0].train(bar)
@@ -128,14 +142,57 @@ def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tupl
     name = arguments.algo or {recipe.name: key for key, recipe in recipes.items()}.get(agents, agents)
     if name not in recipes:
         raise CzError(f"{name!r} is no recipe here: name one of {', '.join(recipes)} by --algo")
-    chosen = {field: settings[field] for field in ("num_envs", "batch_size", "scenario", "puller") if field in settings}
+    own = recipes[name]
+    fields = {each.name for each in dataclass_fields(own)} - {"name", "steps"}
+    chosen = {field: _listed(settings[field], getattr(own, field)) for field in fields & settings.keys()}
     given = {"scenario": arguments.scenario, "puller": arguments.puller}
     chosen |= {field: value for field, value in given.items() if value}
-    steps = arguments.steps or saved.get("steps") or recipes[name].steps
-    recipe = replace(recipes[name].with_steps(steps), **chosen)
+    chosen |= dict(_setting(text, own) for text in arguments.set)
+    steps = arguments.steps or saved.get("steps") or own.steps
+    recipe = replace(own.with_steps(steps), **chosen)
     chosen_puller(recipe.puller or None)
     check_config(recipe.config)
     return recipe, saved.get("seed", 0) if arguments.seed is None else arguments.seed
+
+
+def _setting(text: str, recipe: TrainingConfig) -> tuple[str, Any]:
+    """The field of a recipe and its value in FIELD=VALUE; CzError for a field or a value that cannot be meant."""
+    name, sign, value = (part.strip() for part in text.partition("="))
+    known = {each.name for each in dataclass_fields(recipe)} - {"name", "steps", "environment", "stages"}
+    if not sign or name not in known:
+        raise CzError(f"--set {text}: {unknown_name_message('field', name, sorted(known))}")
+    usual = getattr(recipe, name)
+    try:
+        return name, _typed(value, usual)
+    except ValueError:
+        kind = "numbers with commas between" if isinstance(usual, tuple) else type(usual).__name__
+        raise CzError(f"--set {text}: {name} must be {kind}, as {usual!r}") from None
+
+
+def _typed(text: str, usual: Any) -> Any:
+    """A text as a value of the type of the usual one; ValueError if it is none, or a number that is not positive."""
+    if isinstance(usual, bool):
+        words = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
+        if text.lower() not in words:
+            raise ValueError
+        return words[text.lower()]
+    if isinstance(usual, tuple):
+        return tuple(_typed(part, usual[0]) for part in text.strip("()[]").split(",") if part)
+    if isinstance(usual, str):
+        return text
+    number = type(usual)(float(text)) if isinstance(usual, int) and float(text).is_integer() else type(usual)(text)
+    if not math.isfinite(number) or (number <= 0 and usual > 0 and not 0 <= number == int(number)):
+        raise ValueError
+    return number
+
+
+def _listed(value: Any, usual: Any) -> Any:
+    return tuple(value) if isinstance(usual, tuple) else value
+
+
+def _absolute(place: str) -> str:
+    file, colon, name = place.rpartition(":")
+    return f"{Path(file).absolute()}{colon}{name}" if file else place
 
 
 def _seeds(text: str) -> range:

@@ -203,12 +203,58 @@ def test_ctrl_c_in_the_middle_of_an_update_saves_after_it(tmp_path, monkeypatch,
         (["--scenario", "hard=much"], "'hard=much' is no scenario with its share"),
         (["--scenario", "none.py:quiet"], "none.py: no such file"),
         (["--resume"], "nothing to resume"),
+        (["--set", "learning_rat=1"], "unknown field 'learning_rat': did you mean 'learning_rate'?"),
+        (["--set", "n_epochs=few"], "--set n_epochs=few: n_epochs must be int, as 5"),
+        (["--set", "learning_rate=-1"], "learning_rate must be float, as 0.001"),
+        (["--set", "hidden=a,b"], "hidden must be numbers with commas between, as (32, 32)"),
+        (["--set", "steps=7"], "unknown field 'steps'"),
+        (["--callback", "none.py:Watch"], "none.py: no such file"),
         (["--env", "CzCrystal-v0", "--algo", "sac"], "'sac' is no recipe here: name one of ppo, gradient by --algo"),
     ],
 )
 def test_a_wrong_command_is_refused_in_one_line(tmp_path, arguments, message, refused):
     assert message in refused(train.main, [*arguments, "--out", str(tmp_path / "run")])
     assert not (tmp_path / "run").exists()
+
+
+CALLBACK = """
+from stable_baselines3.common.callbacks import BaseCallback
+
+class Tracker(BaseCallback):
+    def _on_training_end(self):
+        with open(__file__ + ".log", "a") as log:
+            print(self.model.n_epochs, self.model.policy.net_arch, file=log)
+
+    def _on_step(self):
+        return True
+"""
+
+
+@pytest.mark.usefixtures("quick")
+def test_fields_of_a_recipe_and_trackers_come_from_the_command(tmp_path):
+    """A resumed run keeps its fields."""
+    (tmp_path / "own.py").write_text(CALLBACK)
+    command = ["--out", str(tmp_path / "run"), "--callback", f"{tmp_path / 'own.py'}:Tracker"]
+    chosen = ["--set", "learning_rate=3e-4", "--set", "n_epochs=2", "--set", "hidden=8,8", "--set", "told=no"]
+    assert train.main([*command, *chosen, "--steps", "5000"]) == 0
+    saved = content(tmp_path / "run" / "settings.json")["settings"]
+    assert (saved["learning_rate"], saved["n_epochs"], saved["hidden"], saved["told"]) == (3e-4, 2, [8, 8], False)
+    assert OnnxPolicy.load(tmp_path / "run" / "agent.onnx").contract.learned_from == "reward"
+    assert train.main([*command, "--resume", "--steps", "10000"]) == 0
+    first, second = (tmp_path / "own.py.log").read_text().splitlines()
+    for line in (first, second):
+        assert line == "2 {'pi': [8, 8], 'vf': [64, 64]}"
+
+
+def test_ctrl_c_before_anything_was_kept_advises_no_resume(tmp_path, monkeypatch, capsys):
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(recipes, "references", interrupted)
+    assert train.main(["--steps", "12000", "--out", str(tmp_path / "run")]) == 130
+    told = capsys.readouterr()
+    assert told.err == "cz-gym train: interrupted; nothing was kept yet\n"
+    assert told.out.splitlines()[-1].startswith("ppo, seed 0, 12,000 steps on "), "the first word before the references"
 
 
 # Training seeds in parallel come out as one by one, and nothing is lost or done twice.

@@ -15,16 +15,17 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 
 from cz_gym import CzVectorEnv, agents
+from cz_gym.agents import OnnxPolicy, recipes
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import user_controller
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.examples import anywhere, gradient, ppo_lagrangian, sb3_ppo
 from cz_gym.sb3 import CzVecEnv
 from cz_gym.support.units import KILO, MINUTE, MM_PER_MIN
 from cz_gym.tools.registry import make_controller
-from examples import gradient, ppo_lagrangian, sb3_ppo
 from tests.observed import PLAIN
 
 SEEDS = range(1_000_000, 1_000_002)
@@ -134,3 +135,15 @@ def test_every_file_says_its_command():
         # RL-Zoo 2.9 evaluates on an environment without the file's env_kwargs.
         for key, value in read(path.stem).get("env_kwargs", {}).items():
             assert f"--env-kwargs \"{key}:'{value}'\"" in text
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+@pytest.mark.parametrize("manner", anywhere.LOOPS)
+def test_a_loop_in_the_manner_of_each_library_ends_in_an_agent_file(manner, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(recipes, "JUDGING_SEEDS", recipes.JUDGING_SEEDS[:2])
+    file = tmp_path / "agent.onnx"
+    command = [manner, "--minutes", "0.01", "--crystals", "64", "--seed", "3", "--out", str(file)]
+    assert anywhere.main(command) == 0
+    contract = OnnxPolicy.load(file).contract
+    assert (contract.training_seed, contract.observation, contract.learned_from) == (3, "history", "reward")
+    assert f"{contract.training_steps:,} steps" in capsys.readouterr().out

@@ -14,7 +14,7 @@ from cz_gym.baselines.pid import SeriesPID
 from cz_gym.body.process import radius_model
 from cz_gym.process import PULL_SCALE
 from cz_gym.support.units import MM
-from studies import bode
+from cz_gym.tools import bode
 from studies.paper import __main__ as paper
 from studies.paper.experiments import BARE, errors, inverse_response, pull_change, ramp, ramp_numbers, trace
 from studies.paper.figures import FIGURES

@@ -17,8 +17,9 @@ from cz_gym.body.process import radius_model
 from cz_gym.evaluation import protocol
 from cz_gym.evaluation.protocol import CASES, TRAINING_SEEDS
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.tools import leaderboard
 from cz_gym.tools.report.task_records import contract_hash
-from studies import cards, frontier, leaderboard, ranks, robustness, speed, stock
+from studies import cards, frontier, ranks, robustness, speed, stock
 
 FIGURES = {key: {"mean": 0.0, "ci95": [0.0, 0.5]} for key in (*(of.metric for of in cards.FIGURES), cards.RETURN)}
 

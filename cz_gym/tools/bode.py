@@ -1,12 +1,12 @@
 """Bode plot and margins of a controller's loop with the default puller near rest, and the hot zones that it survives.
 
-``python -m studies.bode lqg`` takes a shipped controller, ``python -m studies.bode my.py:SlowPID`` one of your own,
+``cz-gym bode lqg`` takes a shipped controller, ``cz-gym bode my.py:SlowPID`` one of your own,
 whose ``state`` must be a NamedTuple of arrays.
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,12 +17,11 @@ from cz_gym.evaluation.protocol import user_controller
 from cz_gym.physics.plant import make_puller
 from cz_gym.process import StateSpace
 from cz_gym.puller.file import DEFAULT, PullerFile, chosen_puller
+from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.errors import CzError
-from cz_gym.support.files import write_files
+from cz_gym.support.files import check_writable, write_files
 from cz_gym.tools.registry import make_controller
 from cz_gym.tools.report.tables import markdown as table
-
-from .common import StudyParser
 
 PLACES = {"camera": "ring", "v_p": "pull speed", "Q_H": "heater"}
 """Names of the places where the loop is opened."""
@@ -67,14 +66,16 @@ def picture(name: str, dt: float, loops: dict[str, StateSpace]) -> bytes:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = StudyParser("bode", __doc__, "runs/bode.png")
+    parser = OneLineParser("cz-gym bode", (__doc__ or "").split("\n")[0])
     parser.add_argument("controller", help="name of a shipped controller, or FILE.py:NAME")
     parser.add_argument("--mix", type=float, default=0.5, help="1: Model I, 0: Model II (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("runs/bode.png"), help="picture to write (%(default)s)")
     parser.add_puller("the loop with its plant")
-    return parser.run(_main, arguments)
+    return parser.run(_main, arguments, "benchmark")
 
 
 def _main(given: argparse.Namespace) -> None:
+    check_writable(given.out.parent)
     if not 0.0 <= given.mix <= 1.0:
         raise CzError(f"--mix must lie in [0, 1], not {given.mix:g}")
     own = chosen_puller(given.puller)
@@ -99,7 +100,3 @@ def _main(given: argparse.Namespace) -> None:
     print(table(("factor on", "stable from", "to"), zones))
     write_files({given.out: picture(given.controller, form.dt, loops)})
     print(f"wrote {given.out}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""A leaderboard of submitted agents, each run again on fresh crystals: ``python -m studies.leaderboard FOLDER``.
+"""A leaderboard of submitted agents, each run again on fresh crystals: ``cz-gym leaderboard FOLDER``.
 
 A submission is a folder FOLDER/NAME with the agent's files (``*.onnx``, each with its ``.json``), one a training seed,
 and the ``benchmark.json`` that ``benchmark.py --agent NAME=FILE ...`` wrote of them.
@@ -6,7 +6,6 @@ and the ``benchmark.json`` that ``benchmark.py --agent NAME=FILE ...`` wrote of 
 
 import argparse
 import secrets
-import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -31,7 +30,13 @@ BUDGETS = {"1 M": 1_000_000, "5 M": 5_000_000, "20 M": 20_000_000}
 """Classes of agents by the environment steps of their longest training; the rest is open."""
 OVERSHOOT = 1.05
 """Share of a budget that a training may take: it ends with an update, which may end later."""
-HEADS = ("budget", "place", "agent", "told", "training seeds", "claimed RMSE [mm]", "here", "lost here [%]", "contract")
+HEADS = (
+    "budget, declared", "place", "agent", "told, declared", "training seeds", "claimed RMSE [mm]", "here",
+    "lost here [%]", "contract", "hash",
+)  # fmt: skip
+DECLARED = """Steps, and what an agent was told, are what its maker declares: nothing measures them, and another maker's
+run may not repeat them. The hash is of network and declarations of the first training seed: who changes either changes
+it. "Here" is measured."""
 TOLD = {
     protocol.GROUPS[protocol.REWARD]: "nothing",
     protocol.GROUPS[protocol.STATE]: "state, in training",
@@ -84,19 +89,20 @@ def page(benchmark: Benchmark, claims: Claims) -> str:
         own = RMSE.of(benchmark, cases[0], name)
         same = "the same" if contract == contract_hash(cases) else f"other: `{contract or 'unknown'}`"
         seeds, lost = str(len(here[name].training_seeds)), f"{100.0 * mean(name, 'failure_rate'):.2f}"
-        lines.append((spent, str(places[spent]), name, told, seeds, f"{claim:.3f}", own, lost, same))
+        digest = f"`{here[name].trained[0].contract.hash[:12]}`"
+        lines.append((spent, str(places[spent]), name, told, seeds, f"{claim:.3f}", own, lost, same, digest))
     seeds = f"{crystals[0]} to {crystals[-1]}"
     about = (
         f"Submitted agents on {len(crystals)} fresh crystals of each scenario (seeds {seeds}), by mean RMSE. "
         f'"Claimed" and "here" are the RMSE on {cases[0].name}, from the submission and from these crystals.'
     )
     beside = "Every scenario, beside classical controllers:"
-    return "\n\n".join(["# Leaderboard", about, table(HEADS, lines), beside, summary(benchmark)]) + "\n"
+    return "\n\n".join(["# Leaderboard", about, DECLARED, table(HEADS, lines), beside, summary(benchmark)]) + "\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser("python -m studies.leaderboard", (__doc__ or "").split("\n")[0])
+    parser = OneLineParser("cz-gym leaderboard", (__doc__ or "").split("\n")[0])
     parser.add_argument("folder", type=Path, help="folder of the submissions, a folder each")
     about = "fresh crystals a scenario (default: %(default)s)"
     parser.add_argument("--episodes", type=between(2, len(protocol.TEST_SEEDS)), default=100, help=about)
@@ -120,11 +126,7 @@ def _main(given: argparse.Namespace) -> None:
     contenders = [*(each for each in CONTROLLERS if each.quoted), *agents]
     benchmark = run(contenders, cases, given.episodes, given.out)
     text = page(benchmark, {contender.name: claim for contender, claim in submitted})
-    command = f"python -m studies.leaderboard {given.folder} --episodes {given.episodes} --first-seed {first}"
+    command = f"cz-gym leaderboard {given.folder} --episodes {given.episodes} --first-seed {first}"
     files = {"leaderboard.md": text, "leaderboard.json": to_json(benchmark, command)}
     write_files({given.out / name: content.encode() for name, content in files.items()})
     print(text)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
