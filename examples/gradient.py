@@ -1,6 +1,6 @@
-"""Train analytic policy gradients on Cz-v0, from nothing: ``python -m examples.gradient``, four minutes.
+"""Train analytic policy gradients on Cz-v0, from nothing: ``python -m cz_gym.examples.gradient``, four minutes.
 
-The gradient of the cost goes back through the plant. ``python benchmark.py --agent runs/gradient.onnx`` runs the agent.
+The gradient of the cost goes back through the plant. ``cz-gym benchmark --agent runs/gradient.onnx`` runs the agent.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""From a puller's log to a report and a controller: ``python -m examples.identify LOG.csv start.toml my.toml``.
+"""From a puller's log to a report and a controller: ``python -m cz_gym.examples.identify LOG.csv start.toml my.toml``.
 
 Without arguments a simulated puller makes the log. docs/your-puller.md explains each step.
 """

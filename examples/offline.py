@@ -1,4 +1,4 @@
-"""Offline learning from recorded crystals, no crystal pulled: ``python -m examples.offline`` (extras data and agents).
+"""Offline learning from recorded crystals, no crystal pulled: ``python -m cz_gym.examples.offline`` (extras data and agents).
 
 Behaviour cloning and TD3+BC (Fujimoto and Gu, 2021) on each dataset, three training seeds each. Scores: Minari's, 0 is
 open loop, 100 the best classical controller of README's table, both on the same validation crystals.
@@ -180,7 +180,7 @@ def compare(name: str, seeds: int) -> list[tuple[str, ...]]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
-    parser = argparse.ArgumentParser("python -m examples.offline", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser("python -m cz_gym.examples.offline", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--sets", default=",".join(SETS), help="datasets (default: %(default)s)")
     parser.add_argument("--seeds", type=int, default=SEEDS, help="training seeds (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("runs/offline.md"), help="table (default: %(default)s)")

@@ -90,7 +90,7 @@ async def run(arguments: argparse.Namespace) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Control a puller; 0 when its crystal has ended, 2 for bad input, 130 when interrupted."""
     logging.getLogger("asyncua").setLevel(logging.ERROR)
-    parser = OneLineParser("python -m examples.opcua_controller", "Control a puller over OPC UA.")
+    parser = OneLineParser("python -m cz_gym.examples.opcua_controller", "Control a puller over OPC UA.")
     add = parser.add_argument
     add("--url", default="opc.tcp://127.0.0.1:4840/", help="server (%(default)s)")
     add("--controller", default="paper", metavar="NAME", help="controller, agent or agent file (%(default)s)")
