@@ -188,7 +188,7 @@ _SHARED = signals(Measured)
 
 
 class TrueState(NamedTuple):
-    """The true state and the disturbances; deviations from the puller's own nominal, SI units.
+    """The true state and the disturbances; deviations from the puller's own nominal, SI units; the recipe as told.
 
     For bounds and for training; no agent acts on it.
     """
@@ -201,7 +201,7 @@ class TrueState(NamedTuple):
     r_ref: Annotated[Any, _SHARED["r_ref"]]
     r_ref_1min: Annotated[Any, _SHARED["r_ref_1min"]]
     r_ref_5min: Annotated[Any, _SHARED["r_ref_5min"]]
-    T_1_ref: Annotated[Any, Channel("K", TEMPERATURE_SCALE, "recipe of the heater temperature minus its own nominal")]
+    T_1_ref: Annotated[Any, _SHARED["T_1_ref"]]
     T_1_ref_1min: Annotated[Any, _SHARED["T_1_ref_1min"]]
     T_1_ref_5min: Annotated[Any, _SHARED["T_1_ref_5min"]]
     v_p: Annotated[Any, _SHARED["v_p"]]
@@ -216,7 +216,7 @@ class TrueState(NamedTuple):
 @jittable
 def true_state(slot: Any, measured: Any, t: Any) -> Any:
     """:class:`TrueState` of a slot at its sample's time t [s]."""
-    p, x, warmer = slot.puller, slot.x, slot.episode.told_temperature
+    p, x = slot.puller, slot.x
     return TrueState(
         r_c_error=x.r_c - p.r_0 - measured.r_ref,
         h_c=x.h_c - p.h_0,
@@ -226,9 +226,9 @@ def true_state(slot: Any, measured: Any, t: Any) -> Any:
         r_ref=measured.r_ref,
         r_ref_1min=measured.r_ref_1min,
         r_ref_5min=measured.r_ref_5min,
-        T_1_ref=measured.T_1_ref + warmer,
-        T_1_ref_1min=measured.T_1_ref_1min + warmer,
-        T_1_ref_5min=measured.T_1_ref_5min + warmer,
+        T_1_ref=measured.T_1_ref,
+        T_1_ref_1min=measured.T_1_ref_1min,
+        T_1_ref_5min=measured.T_1_ref_5min,
         v_p=slot.v_p - p.v_0,
         Q_H=slot.Q_H - p.Q_H_0,
         v_p_mean=slot.v_p_mean - p.v_0,
