@@ -16,17 +16,11 @@ from cz_gym.crystal.process import CRYSTAL
 from cz_gym.spaces import HISTORY
 from tests.contracts import facts
 
-SHIPPED = {"gradient": 10, "gradient-along": 5, "ppo": 5, "ppo-along": 5, "ppo-plain": 3, "sac": 5}
+SHIPPED = {"gradient": 10, "gradient-along": 5, "ppo": 5, "ppo-plain": 3, "sac": 5}
 """Training seeds of each name."""
-BEFORE_THE_EDGE = pytest.mark.xfail(
-    reason="trained before the crystal's edge was a channel: refused until trained again",
-    raises=AgentFileError,
-    strict=True,
-)
-ALL = [pytest.param(name, marks=BEFORE_THE_EDGE) if name.endswith("-along") else name for name in SHIPPED]
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", SHIPPED)
 def test_every_shipped_agent_is_called_by_how_it_was_made(name):
     contracts = [read_agent(path)[0] for path in agents.shipped_seeds(name)]
     assert [contract.training_seed for contract in contracts] == list(range(SHIPPED[name]))
