@@ -10,14 +10,15 @@ from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import version
 from io import TextIOWrapper
+from pathlib import Path
 from threading import Timer
 
 COMMANDS = {
     "train": ("cz_gym.tools.train", "train an agent by a recipe"),
     "benchmark": ("cz_gym.tools.benchmark", "compare controllers and agents on the same crystals"),
+    "tune": ("cz_gym.tools.tune", "search settings of controllers, or design them for a puller"),
     "check": ("cz_gym.tools.check", "check an agent or a controller before a run"),
     "leaderboard": ("cz_gym.tools.leaderboard", "run submitted agents again on fresh crystals"),
-    "tune": ("cz_gym.tools.tune", "search settings of controllers, or design them for a puller"),
     "identify": ("cz_gym.tools.identify.command", "estimate a puller's numbers from its log"),
     "bode": ("cz_gym.tools.bode", "margins and Bode plot of a controller's loop"),
     "puller": ("cz_gym.tools.puller", "print what a puller file implies"),
@@ -28,6 +29,11 @@ COMMANDS = {
     "data": ("cz_gym.tools.datasets", "record datasets for offline learning"),
 }
 """For each word its module, whose ``main`` takes the arguments after it, and what it does."""
+EXTRAS = {
+    **dict.fromkeys(("matplotlib", "plotly", "tqdm", "pandas", "control", "onnx", "onnxruntime"), "benchmark"),
+    **dict.fromkeys(("stable_baselines3", "torch", "filelock"), "agents"),
+}
+"""Extras of packages that commands import at their beginning."""
 SOON = 0.5
 """Time after which a command says that it loads [s]."""
 HELP = "\n".join([
@@ -49,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
     except OSError as error:
         try:
-            sys.stdout.flush()
+            print(flush=True)  # fails again if it was stdout
         except OSError:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             if isinstance(error, BrokenPipeError):
@@ -83,7 +89,9 @@ def _run(arguments: Sequence[str] | None) -> int:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("cz_gym"):
             raise
-        extra = ': pip install ".[benchmark]"' if error.name in ("matplotlib", "plotly", "tqdm") else ""
+        own = "." if (Path(__file__).parent / "pyproject.toml").is_file() else "cz-gym"
+        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        extra = f': pip install "{own}[{extra}]"' if extra else ""
         print(f"cz-gym {word}: {error}{extra}", file=sys.stderr)
         return 2
     finally:

@@ -1,4 +1,4 @@
-"""Offline learning from recorded crystals, no crystal pulled: ``python -m cz_gym.examples.offline`` (extras data and agents).
+"""Offline learning from recorded crystals, no crystal pulled: ``python -m cz_gym.examples.offline`` (data, agents).
 
 Behaviour cloning and TD3+BC (Fujimoto and Gu, 2021) on each dataset, three training seeds each. Scores: Minari's, 0 is
 open loop, 100 the best classical controller of README's table, both on the same validation crystals.

@@ -1,4 +1,4 @@
-"""Train PPO under a constraint: few steps out of tolerance (``info["cost"]``): ``python -m cz_gym.examples.ppo_lagrangian``.
+"""Train PPO under a constraint, few steps out of tolerance: ``python -m cz_gym.examples.ppo_lagrangian``.
 
 A Lagrange multiplier is the price of such a step: it rises while their share is above the limit, and falls below.
 """

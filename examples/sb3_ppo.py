@@ -1,4 +1,4 @@
-"""Train stable-baselines3's own PPO on Cz-v0, from nothing, by reward: ``python -m cz_gym.examples.sb3_ppo``, 5 minutes.
+"""Train stable-baselines3's own PPO on Cz-v0, from nothing, by reward: ``python -m cz_gym.examples.sb3_ppo``.
 
 ``cz-gym benchmark --agent runs/sb3-ppo.onnx`` puts the agent into the table.
 """

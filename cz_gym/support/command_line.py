@@ -117,7 +117,8 @@ def run_command(
 
 def missing(module: str, extra: str) -> str:
     """Return the line on a package that is not installed; ``extra`` names the extras of the command."""
-    return f'{module} is missing: pip install ".[{OWN_EXTRA.get(module, extra)}]"'
+    own = "." if (Path(__file__).parents[2] / "pyproject.toml").is_file() else "cz-gym"
+    return f'{module} is missing: pip install "{own}[{OWN_EXTRA.get(module, extra)}]"'
 
 
 def relative_path(path: str | Path) -> str:

@@ -284,7 +284,6 @@ def _write_all(given: argparse.Namespace) -> None:
         for name in given.policies.split(",")
     ]
     one = partial(_write_one, datasets_root().absolute(), TRAINING_SEEDS[: given.episodes], given.noise, settings)
-    print(f"into {datasets_root().absolute()}", flush=True)
     on_cluster = run_parallel(one, tasks, None, given.cluster, datasets_root().absolute())
     for _, line in on_cluster if given.cluster else enumerate(map(one, tasks)):
         print(line, flush=True)
@@ -297,7 +296,7 @@ def _write_one(
     os.environ["MINARI_DATASETS_PATH"], began = str(root), time.perf_counter()
     dataset = write(*task, seeds, noise, **settings)
     said = f"{dataset.id}: {dataset.total_episodes} episodes, {dataset.total_steps:,} steps, "
-    return f"{said}{dataset.storage.get_size():.0f} MB, {time.perf_counter() - began:.1f} s"
+    return f"{said}{dataset.storage.get_size():.0f} MB, {time.perf_counter() - began:.1f} s, into {root}"
 
 
 if __name__ == "__main__":

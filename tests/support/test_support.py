@@ -21,7 +21,7 @@ from cz_gym.support.files import LOCK, check_writable, locked, name_file_in_erro
 from cz_gym.tools import benchmark, datasets, play, tune
 from studies import speed
 from studies.paper import __main__ as paper
-from tests.conftest import python
+from tests.conftest import ROOT, python
 
 KILL_AT_EVERY_LINE = """
 import os, signal, sys
@@ -272,3 +272,28 @@ def test_every_package_of_the_extras_is_known_as_optional():
     optional = project["optional-dependencies"]
     needed = {re.split(r"[^\w-]", line)[0].replace("-", "_") for extra in optional.values() for line in extra}
     assert needed - building - documenting - {"cz_gym", "pygame_ce", "protobuf"} == {*OPTIONAL} - {"h5py"}
+
+
+FULL = pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a device that is always full")
+
+
+@FULL
+@pytest.mark.parametrize("words", [["--help"], ["puller", "default"]])
+def test_a_full_disk_is_told_in_one_line(words):
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "cz_gym", *words]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    said = [line for line in done.stderr.splitlines() if not line.endswith("loading its packages")]
+    assert done.returncode == 2
+    assert len(said) == 1
+    assert said[0].endswith("the output cannot be written: No space left on device")
+
+
+def test_a_terminal_of_ascii_shows_question_marks():
+    """As of a cron job."""
+    env = {name: value for name, value in os.environ.items() if not name.startswith(("LC_", "LANG", "PYTHON"))}
+    env |= {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
+    command = [sys.executable, "-m", "cz_gym", "puller", "default"]
+    done = subprocess.run(command, capture_output=True, text=True, env=env, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.isascii()
