@@ -175,8 +175,12 @@ def test_a_block_is_its_controller_in_every_language(name, scenario):
             last = last._replace(
                 v_p=read.v_p, v_p_mean=read.v_p_mean, Q_H=read.Q_H, ring_error=read.ring_error, valid=read.valid
             )
-            state = controller.at_rest(last) if state is None else state
-            pull, heat, state = controller.step(last._replace(T_1=seen.T_1), state)
+            off, warmer = memories[0].Q_H_offset, memories[0].T_1_offset  # what the takeover finds wrong of nominal
+            warm = {each: getattr(last, each) - warmer for each in last._fields if each.startswith("T_1")}
+            own_seen = last._replace(Q_H=last.Q_H - off, **warm)
+            state = controller.at_rest(own_seen) if state is None else state
+            pull, heat, state = controller.step(own_seen._replace(T_1=seen.T_1 - warmer), state)
+            heat = heat + off
             wanted = np.clip(np.stack([pull / config.parameters.v_0, heat / HEATER_RANGE], axis=-1), -1.0, 1.0)
             follows = own[ALARMS].astype(int) & (Alarm.ASTRAY | Alarm.MANUAL | Alarm.TAKEOVER) == 0
             assert k == 0 or action[follows] == pytest.approx(wanted[follows], abs=1e-9)
@@ -286,7 +290,7 @@ def test_a_stuck_ring_costs_no_crystal_and_its_controller_comes_back_without_a_b
 
 
 def test_a_shadow_runs_beside_a_log(tmp_path):
-    env = CzEnv("puller", observation="measured", action="direct", info="all", horizon=3600.0)
+    env = CzEnv("puller-frames", observation="measured", action="direct", info="all", horizon=3600.0)
     record_log(env, make_controller("paper-tuned", env.config), tmp_path / "log.csv", seed=1)
     assert main(["paper-tuned", "--shadow", str(tmp_path / "log.csv"), "--out", str(tmp_path / "shadow")]) == 0
     table = np.genfromtxt(tmp_path / "shadow" / "shadow.csv", delimiter=",", names=True)
