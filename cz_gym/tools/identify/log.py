@@ -53,7 +53,24 @@ COLUMNS: dict[str, Units] = {
 REQUIRED, RECORDED = tuple(COLUMNS)[:5], tuple(COLUMNS)[:8]
 """Columns that a log must have, and those that :func:`record_log` writes."""
 DRIVES = "pull_speed_mm_per_min", "heater_power_kW"
-ABSENT = ("", "nan", "null", "none", "na", "n/a", "#n/a", "-", "--", "---", "<na>", "nat", "1.#qnan", "-1.#ind")
+ABSENT = (
+    "",
+    "nan",
+    "null",
+    "none",
+    "na",
+    "n/a",
+    "#n/a",
+    "-",
+    "--",
+    "---",
+    "<na>",
+    "nat",
+    "1.#qnan",
+    "-1.#ind",
+    "1.#inf",
+    "-1.#inf",
+)
 """Fields that hold no number."""
 MEANT = "on", "off", "true", "false"
 """Words that stand for a number, so that they are not missing."""
@@ -284,6 +301,10 @@ def _read_times(text: Any, unit: str) -> tuple[Any, bool]:
         parts = text.str.extract(rf"^{_CLOCK.replace(':?', ':')}$")
         return _seconds(parts), bool(parts[["sign", "zone"]].isna().all(axis=None))
     plain = text.str.replace(rf"^{_WORD}\.?,? +(?=\d|{_WORD})", _no_weekday, regex=True)
+    in_c = (
+        rf"^({_WORD}) +(\d{{1,2}}) (\d{{1,2}}:\d{{2}}:\d{{2}})((?: \w{{1,4}})?) (\d{{4}})$"  # Sun Mar  1 12:00:05 2026
+    )
+    plain = plain.str.replace(in_c, r"\1 \2 \5 \3\4", regex=True)
     plain = plain.str.replace(r"^(\d{4})年(\d{1,2})月(\d{1,2})日", r"\1-\2-\3", regex=True)
     times, naive = pandas.Series(np.nan, text.index), True
     for form in _FORMS[unit]:

@@ -207,6 +207,9 @@ FORMATS = {
             stamped(rows, "%d. %b %Y %H:%M:%S", "2026-05-31T23:00:00")), "time_s=time_s:dmy",
     ),
     "a weekday, month first": (lambda rows: stamped(rows, "%a %b %d, %Y %I:%M:%S %p"), "time_s=time_s:iso"),
+    "the year at the end, as C writes it": (
+        lambda rows: stamped(rows, "%a %b %d %H:%M:%S %Y"), "time_s=time_s:iso",
+    ),
     "compact times": (lambda rows: stamped(rows, "%Y%m%dT%H%M%S"), "time_s=time_s:iso"),
     "a zone by name (delorean #101)": (
         lambda rows: stamped(rows, "%Y-%m-%dT%H:%M:%S+01:00[Europe/Berlin]"), "time_s=time_s:iso",
