@@ -22,7 +22,7 @@ from cz_gym.support.errors import CzError
 from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 from cz_gym.tools.report.tables import markdown
 
-from .block import INPUTS, OUTPUTS, Alarm, meanings
+from .block import INPUTS, OUTPUTS, Alarm, in_shares, meanings
 from .shell import Block
 from .trace import PASSES, Floats, Port, Program
 from .writer import StatementWriter, runs
@@ -219,6 +219,34 @@ def setpoints_on_log(block: Block, log: Any) -> tuple[Floats, Floats]:
     return outputs_of_rows[:, :2], outputs_of_rows[:, 2].astype(int)
 
 
+READABLE, NEAR = 0.05, 0.05
+"""Largest share of rows with a bad reading, and largest mean difference of a setpoint in shares of its range, that a
+good verdict allows [-]."""
+BAD_READINGS = Alarm.RING, Alarm.PYROMETER, Alarm.DRIVES, Alarm.REFERENCE, Alarm.LATE, Alarm.CLOCK, Alarm.RING_STEP
+STOPS = Alarm.MODEL, Alarm.FAILED, Alarm.SETTINGS, Alarm.RADIUS
+
+
+def verdict(alarms: Any, differences: Floats) -> str:
+    """Say by the alarms of each row, and the differences of setpoints from drives in shares of their ranges, shape
+    (rows, 2), what stands against a trial of the block.
+    """
+    shares = {bit: float(np.mean(np.asarray(alarms) & bit > 0)) for bit in (*BAD_READINGS, *STOPS)}
+    against = [f"{bit.name} in {100.0 * shares[bit]:.3g} % of rows" for bit in BAD_READINGS if shares[bit] > READABLE]
+    against += [f"{bit.name} in {100.0 * shares[bit]:.3g} % of rows" for bit in STOPS if shares[bit] > 0.0]
+    against += [
+        f"a mean {name} of {100.0 * each:.3g} % of its range from the present loop's"
+        for name, each in zip(("pull speed", "heater power"), differences.mean(axis=0), strict=True)
+        if abs(each) > NEAR
+    ]
+    if against:
+        return f"**Not ready**: {'; '.join(against)}. Find the cause first."
+    return (
+        "**Nothing in this log stands against a trial under supervision**: readings were good in "
+        f"{100.0 * (1.0 - READABLE):.3g} % of rows, its model explains them, and its setpoints stay near those of the "
+        "present loop. A log shows no answer of the crystal to the block's own moves."
+    )
+
+
 def shadow(block: Block, log: Any) -> dict[str, str]:
     """A table of the setpoints, as CSV, and a report that compares them with the drives of a log; by file name."""
     setpoints, alarms = setpoints_on_log(block, log)
@@ -232,11 +260,13 @@ def shadow(block: Block, log: Any) -> dict[str, str]:
         (bit.name, f"{100.0 * np.mean(alarms & bit > 0):.3g}", text)
         for bit, text in meanings(Alarm).items() if np.any(alarms & bit)
     ]  # fmt: skip
+    wanted, applied = (dict(zip(names, each.T, strict=True)) for each in (setpoints, held))
     heads = "setpoint", "mean difference", "RMS", "5 % quantile", "95 % quantile"
     report = (
         f"# {block.name} beside a log\n\n{len(log.time)} rows over {log.time[-1] / MINUTE:.4g} min. In every row the "
         "block starts from the applied drives; its setpoint is compared with what the present loop applied next.\n\n"
-        f"{markdown(heads, rows)}\n\n{markdown(('alarm', 'share of rows [%]', 'meaning'), said)}\n"
+        f"{markdown(heads, rows)}\n\n{markdown(('alarm', 'share of rows [%]', 'meaning'), said)}\n\n"
+        f"## Verdict\n\n{verdict(alarms, (in_shares(wanted, block.config) - in_shares(applied, block.config)))}\n"
     )
     table = np.column_stack([log.time, held, setpoints, alarms])
     head = ",".join(("time_s", *(f"applied_{name}" for name in names), *names, "alarms"))

@@ -27,7 +27,7 @@ from cz_gym.tools.export.block import INPUTS, OUTPUTS, Alarm, in_plant_units, in
 from cz_gym.tools.export.command import main, readme
 from cz_gym.tools.export.controllers import identifier_of, make_block, network_of
 from cz_gym.tools.export.shell import BlockPolicy
-from cz_gym.tools.export.text import CompiledBlock, memory_of, write_c, write_st
+from cz_gym.tools.export.text import CompiledBlock, memory_of, verdict, write_c, write_st
 from cz_gym.tools.export.text import test_vector as vector_of
 from cz_gym.tools.export.trace import Graph
 from cz_gym.tools.identify.log import record_log
@@ -297,7 +297,22 @@ def test_a_shadow_runs_beside_a_log(tmp_path):
     before, after = table[f"applied_{PULL}"][99:-2], table[f"applied_{PULL}"][100:-1]
     moves = np.corrcoef(table[PULL][100:-1] - before, after - before)
     assert moves[0, 1] > 0.7  # the controller beside its own loop, whose drives are slow
-    assert "RMS" in (tmp_path / "shadow" / "README.md").read_text()
+    report = (tmp_path / "shadow" / "README.md").read_text()
+    assert "RMS" in report
+    assert "## Verdict" in report
+
+
+@pytest.mark.parametrize(
+    ("bits", "off", "said"),
+    [
+        ([0] * 19 + [Alarm.RING], 0.0, "Nothing in this log stands against"),
+        ([0] * 18 + [Alarm.RING] * 2, 0.0, "Not ready**: RING in 10 % of rows."),
+        ([0] * 19 + [Alarm.MODEL], 0.0, "Not ready**: MODEL in 5 % of rows."),
+        ([0] * 20, 0.1, "Not ready**: a mean heater power of 10 % of its range"),
+    ],
+)
+def test_the_verdict_of_a_shadow_names_what_stands_against_a_trial(bits, off, said):
+    assert said in verdict(np.array(bits, int), np.tile([0.0, off], (20, 1)))
 
 
 @needs_compiler
