@@ -370,7 +370,7 @@ def test_no_two_training_seeds_meet_the_same_crystals(name):
     met = []
     for seed, done in ((0, 0), (1, 0), (2, 0), (1, 327_680)):
         env = make_algorithm(recipe, seed, done).env
-        met.append({int(each) for each in env.unwrapped._seeds})
+        met.append({each.tobytes() for each in env.reset()})
         env.close()
     assert [len(each) for each in met] == [8] * 4
     assert len(set.union(*met)) == 4 * 8
