@@ -110,13 +110,13 @@ def test_stages_of_whole_crystals_have_the_same_report_with_metrics_of_their_own
     assert sorted(path.name for path in crystals.iterdir()) == FILES
     data, report = json.loads((crystals / "benchmark.json").read_text()), (crystals / "report.md").read_text()
     assert list(data["results"]) == ["crown", "tail-puller"]
-    found = data["results"]["crown"]["ring-pid"]
-    assert (found["failure_rate"]["mean"], found["frozen"]["mean"], found["lost_in_crown"]["mean"]) == (1.0, 1.0, 1.0)
+    found = data["results"]["crown"]["recipe"]
+    assert (found["failure_rate"]["mean"], found["frozen"]["mean"], found["lost_in_crown"]["mean"]) == (2 / 3, 0.0, 0.0)
     assert found["tail_max_mm"] == {"mean": None, "ci95": None, "n": 3}
     assert data["largest"]["crown"]["true-radius"]["crown_max_mm"]["mean"] < 1.0
     assert data["provenance"]["parameters"]["heater_max"] is None
     assert report.startswith("No verdict: 3 crystals, ")
-    assert "| ring-pid | 3 frozen | - | - |" in report
+    assert "| recipe | 2 off | " in report
     assert "| controller | lost of crown / tail-puller [%] | 95 % of crowns [mm] | body within 0.5 mm [%] |" in report
 
 
