@@ -260,7 +260,9 @@ def test_the_wheel_holds_one_package_and_what_it_needs(source, tmp_path):
     tops = {name.partition("/")[0] for name in names if ".dist-info/" not in name}
     assert tops == {"cz_gym", "cz_gym_command.py"}
     parts = {part for name in names for part in Path(name).parts}
-    assert not parts & {"tests", "studies", "examples", "docs", "results"}
+    assert not parts & {"tests", "studies", "docs", "results"}
+    assert "cz_gym/examples/sb3_ppo.py" in names
+    assert not any(name.startswith("examples/") for name in names)
     shipped = [f"cz_gym/agents/models/{file.name}" for file in (ROOT / "agents" / "models").glob("*-*.*")]
     assert {"cz_gym/py.typed", *shipped} <= names
     assert len(shipped) > 10
