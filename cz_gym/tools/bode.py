@@ -41,7 +41,7 @@ def phase_of(values: Any) -> Any:
     return phase - 360.0 * (phase[0] // 360.0 + 1.0)
 
 
-def picture(name: str, dt: float, loops: dict[str, StateSpace]) -> bytes:
+def picture(title: str, dt: float, loops: dict[str, StateSpace]) -> bytes:
     """Draw gain and phase of the loops, by the place where they are opened, and their sensitivity, as PNG."""
     from cz_gym.evaluation.plots import COLOURS, GREY, canvas, png
 
@@ -60,7 +60,7 @@ def picture(name: str, dt: float, loops: dict[str, StateSpace]) -> bytes:
         panel.axhline(1.0, color=GREY, lw=0.8)
     sensitivity.set_xlabel("angular frequency [rad/s]")
     gain.legend(fontsize=8, frameon=False)
-    figure.suptitle(f"{name} with the default puller (175 mm)", fontsize=10)
+    figure.suptitle(title, fontsize=10)
     return png(figure)
 
 
@@ -98,5 +98,6 @@ def _main(given: argparse.Namespace) -> None:
     }
     zones = [(name, f"{low:.2f}", f"{high:.2f}") for name, (low, high) in ranges.items()]
     print(table(("factor on", "stable from", "to"), zones))
-    write_files({given.out: picture(given.controller, form.dt, loops)})
+    title = f"{given.controller}, puller {own.label}, share of conduction {given.mix:g}"
+    write_files({given.out: picture(title, form.dt, loops)})
     print(f"wrote {given.out}")

@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 from cz_gym import make_puller
-from cz_gym.baselines import CompensatedPID
+from cz_gym.baselines import CompensatedPID, analysis
 from cz_gym.baselines.analysis import loop_margins
 from cz_gym.baselines.pid import SeriesPID
 from cz_gym.body.process import radius_model
@@ -110,8 +110,8 @@ def test_a_controllers_margins_are_the_design_tables(tmp_path, capsys):
 def test_phases_are_read_against_minus_180_degrees():
     """The phase above -180 degrees at a gain of one is python-control's phase margin."""
     form, puller = bode.form_of("paper"), make_puller(lam=1.0)
-    omega, found = bode.frequencies(form.dt), loop_margins(form.free, puller, form.dt, "v_p")
-    phase = bode.phase_of(bode.response(bode.opened(form.free, puller, form.dt, "v_p"), form.dt, omega))
+    omega, found = analysis.frequencies(form.dt), loop_margins(form.free, puller, form.dt, "v_p")
+    phase = bode.phase_of(analysis.response(analysis.opened(form.free, puller, form.dt, "v_p"), form.dt, omega))
     assert -360.0 <= phase[0] < 0.0
     at = np.argmin(np.abs(np.log(omega / found.crossover)))
     assert phase[at] + 180.0 == pytest.approx(found.phase_deg, abs=1.0)
