@@ -115,7 +115,8 @@ def test_a_claim_stands_beside_what_fresh_crystals_show(submissions, tmp_path):
     assert leaderboard.main(command) == 0
     page = (tmp_path / "leaderboard.md").read_text()
     (line,) = (line for line in page.splitlines() if line.startswith("| open |"))
-    _, budget, place, name, told, seeds, claimed, here, _, contract, made, _ = (
+    cells = [cell.strip() for cell in line.split("|")]
+    _, budget, place, name, told, seeds, claimed, here, _, contract, made, _ = cells
         cell.strip() for cell in line.split("|")
     )
     assert (budget, place, name, told, seeds, claimed) == ("open", "1", "mine", "state, in training", "1", "0.013")
