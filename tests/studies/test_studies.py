@@ -117,8 +117,6 @@ def test_a_claim_stands_beside_what_fresh_crystals_show(submissions, tmp_path):
     (line,) = (line for line in page.splitlines() if line.startswith("| open |"))
     cells = [cell.strip() for cell in line.split("|")]
     _, budget, place, name, told, seeds, claimed, here, _, contract, made, _ = cells
-        cell.strip() for cell in line.split("|")
-    )
     assert (budget, place, name, told, seeds, claimed) == ("open", "1", "mine", "state, in training", "1", "0.013")
     assert contract == "the same"
     assert made == f"`{agents.load(agents.MODELS / 'ppo-seed0.onnx').contract.hash[:12]}`"
