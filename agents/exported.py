@@ -123,7 +123,7 @@ class _Rebuilt:
                 raise GraphError("its outputs do not depend on its inputs")
         lengths = [self._length(name) for name in names]
         if lengths != [2, *self.state]:
-            expected = f"{2} numbers, the action" + "".join(f", then {k} of the next state" for k in self.state)
+            expected = "2 numbers, the action" + "".join(f", then {k} of the next state" for k in self.state)
             raise GraphError(f"gives {' and '.join(map(str, lengths))} numbers in {len(names)} outputs, not {expected}")
         action, *state = (self.rows[name] for name in names)
         self._emit("Identity", [action], OUTPUTS[0])

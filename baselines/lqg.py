@@ -43,7 +43,7 @@ from .lqg_filter import (
 )  # fmt: skip
 from .policy import Floats, MeasuredController, batched, reset_rows, to_action
 
-PULL_SCALE = 0.36 * MM_PER_MIN
+CHARGED_PULL = 0.36 * MM_PER_MIN
 """Deviation of the pull speed at which its quadratic term equals its weight [m/s]; the reward charges its mean, beyond
 a band."""
 STEP_TIME = 5.0
@@ -69,7 +69,7 @@ class Regulator(NamedTuple):
 def quadratic_cost(weights: Weights, dt: float) -> tuple[Floats, Floats, Floats]:
     """Q, N and R of the cost sum z' Q z + 2 z' N du + du' R du, z = (plant's states, previous inputs), for dt [s]."""
     Q, N = np.zeros((PLANT + 2, PLANT + 2)), np.zeros((PLANT + 2, 2))
-    per_square, pull = coefficients(weights), weights.pull / PULL_SCALE**2
+    per_square, pull = coefficients(weights), weights.pull / CHARGED_PULL**2
     per_step = (STEP_TIME / dt) ** 2
     Q[0, 0] = per_square.radius
     Q[PLANT, PLANT] = N[PLANT, 0] = pull

@@ -11,8 +11,8 @@ from cz_gym import SCENARIOS, CzVectorEnv, make_puller
 from cz_gym.baselines.analysis import close, linear_form
 from cz_gym.baselines.clairvoyant import episodes_of, pullers_of
 from cz_gym.baselines.lqg import (
+    CHARGED_PULL,
     LQG,
-    PULL_SCALE,
     LQGDesign,
     PrivilegedLQG,
     look_ahead,
@@ -156,7 +156,7 @@ def test_the_radius_estimate_is_limited_as_the_puller_s_radius_is():
 # The linear plant, with the filter in steady state, against theory: its cost by the covariance equation
 
 LINEAR = LQGDesign(nonlinear=False, gate=np.inf, noise=NoiseModel(camera_memory=np.inf, recipe_share=0.0))
-PER_SQUARE = np.array(coefficients(LINEAR.weights)._replace(pull=LINEAR.weights.pull / PULL_SCALE**2))
+PER_SQUARE = np.array(coefficients(LINEAR.weights)._replace(pull=LINEAR.weights.pull / CHARGED_PULL**2))
 """Its cost of a unit square of radius error, pull speed and both steps; without bands."""
 KNOWN = RingModel(5.0, 0.1 * MM, 10.0 * MINUTE, rotation=(10.0 / MINUTE, 10.0 / MINUTE))
 SCALES = np.array([MM, MM, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0 / HOUR, KILO])
@@ -373,7 +373,7 @@ def test_knowing_more_lowers_the_error_and_the_regulator_s_own_cost_on_the_same_
         squares = coefficients(weights)
         moves = squares.pull_step * (m.pull_step_rms_mm_per_min * MM_PER_MIN) ** 2
         moves += squares.heater_step * (m.heater_step_rms_kw * KILO) ** 2
-        away = weights.pull * (m.pull_rms_mm_per_min * MM_PER_MIN / PULL_SCALE) ** 2
+        away = weights.pull * (m.pull_rms_mm_per_min * MM_PER_MIN / CHARGED_PULL) ** 2
         found.append((m.rmse_mm.mean(), np.mean(squares.radius * (m.rmse_mm * MM) ** 2 + away + moves)))
     plain, privileged = found
     assert privileged[0] < plain[0]
