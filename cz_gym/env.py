@@ -322,7 +322,8 @@ class CzEnv(EnvBase, gym.Env[Array, Array]):
             info = dict(zip(self._names, self._signals, strict=True))
         else:
             info = {name: self._signals[row] for name, row in self._lean}
-        info["action_clipped"] = np.bool_(self._signals.item(self._clipped) > 0.0)
+        # Gymnasium's vectors gather a bool or an array of it, not numpy's bool; TorchRL reads what has a dtype.
+        info["action_clipped"] = np.array(self._signals.item(self._clipped) > 0.0)
         if self._named:
             info["scenario"] = self._batch.scenarios[0]
         if self._everything and self.config.observation == "history":
