@@ -378,16 +378,18 @@ def parse_numbers(column: Any, name: str, notes: dict[str, int]) -> Any:
 def parse_quality(column: Any) -> Any:
     """Parse qualities: 1 where a reading is good, 0 where it is not; NaN where nothing is said.
 
-    Words, 1 and 0, percents, codes of OPC (192 and above is good) and of OPC UA (0 is good, from 2^30 on none is).
-    CzError names a row.
+    Words, 1 and 0, percents, codes of OPC (192 and above is good) and of OPC UA (0 is good, from 2^30 on none is), also
+    hexadecimal: 0xC0 is OPC's, 0x00000000 with its eight digits OPC UA's. CzError names a row.
     """
     import pandas
 
     text = column.fillna("").str.strip()
     low = text.str.lower().str.extract(r"^([^\W\d_]+)")[0]
-    numbers = pandas.to_numeric(_plain_numbers(text), errors="coerce").astype(float)
+    hexadecimal = text.where(text.str.fullmatch(r"0[xX][0-9a-fA-F]{1,8}"))
+    numbers = pandas.to_numeric(_plain_numbers(text.mask(hexadecimal.notna())), errors="coerce").astype(float)
+    numbers = numbers.fillna(hexadecimal.map(lambda code: int(code, 16), na_action="ignore").astype(float))
     codes, largest = numbers.to_numpy(), float(numbers.fillna(0.0).max())
-    if largest >= 2**30:
+    if largest >= 2**30 or hexadecimal.str.len().eq(10).any():
         good = codes < 2**30
     elif largest in (1.0, 100.0) or largest < 1.0:
         good = codes >= max(largest, 1.0) / 2.0

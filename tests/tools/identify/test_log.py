@@ -251,7 +251,8 @@ def test_every_kind_of_table_is_the_same_log(kind, logs, rows, tmp_path):
 @pytest.mark.parametrize(
     ("good", "bad"),
     [("1", "0"), ("1.0", "0.0"), ("TRUE", "FALSE"), ("true", "false"), ("Good", "Bad"), ("192", "0"), ("216", "24"),
-     ("0", "2147483648"), ("100", "0"), ("Good [Local Override]", "Uncertain"), ("OK", "")],
+     ("0", "2147483648"), ("0xC0", "0x18"), ("0x00000000", "0x80000000"), ("0x00000000", "0x40000000"), ("100", "0"),
+     ("Good [Local Override]", "Uncertain"), ("OK", "")],
 )  # fmt: skip
 def test_qualities_of_any_historian_leave_out_the_same_readings(good, bad, rows, tmp_path):
     log = read_log(write(tmp_path / "log.csv", graded(good, bad)(rows)))
