@@ -19,7 +19,7 @@ BROWSER_READY := $(VENV)/.ready-browser
 # A worker that runs out of tests takes some of the other's: files differ too much in time to be dealt out whole.
 IN_PARALLEL := --numprocesses auto --dist worksteal
 
-.PHONY: help venv lint types test test-all stress test-lowest test-newest test-wheel audit lock test-browser benchmark benchmark-full paper docs tables notebooks clean
+.PHONY: help venv lint types test test-all stress test-lowest test-newest test-wheel audit lock test-browser benchmark benchmark-full paper docs tables figures notebooks clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -106,6 +106,9 @@ docs: $(DOCS_READY) ## the documentation site, into build/docs; warnings are err
 
 tables: $(DOCS_READY) ## the tables that pages take from the code, into the pages
 	PYTHONPATH=docs $(BIN)/python -m czdocs.tables
+
+figures: $(TEST_READY) ## the pictures of the pages, into docs/_static
+	PYTHONPATH=docs $(BIN)/python -m czdocs.figures
 
 notebooks: $(DOCS_READY) ## the example pages as Jupyter notebooks, into build/notebooks
 	$(BIN)/python docs/notebooks.py build/notebooks

@@ -19,7 +19,14 @@ root_doc = "docs/index"
 include_patterns = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/**.md", "results/**.md"]
 exclude_patterns = [".*", "build", "dist", "runs", "results/cache", "results/README.md", "docs/_*", "**/.*"]
 exclude_patterns += ["**/node_modules"]
-extensions = ["myst_parser", "sphinx.ext.autodoc", "czdocs.mathml", "czdocs.tables", "czdocs.names"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx_copybutton",
+    "czdocs.mathml",
+    "czdocs.tables",
+    "czdocs.names",
+]
 nitpicky = True
 nitpick_ignore = [("py:func", "make_config"), ("py:func", "prior_sds"), ("py:class", "Variation")]
 nitpick_ignore_regex = [
@@ -46,6 +53,8 @@ html_theme = "furo"
 html_title = f"Cz-v0 {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_favicon = "_static/favicon.svg"
+html_search_scorer = str(Path(__file__).parent / "_static" / "search.js")
 html_extra_path = ["_root"]
 html_copy_source = False
 html_show_sphinx = False

@@ -5,6 +5,8 @@ import pkgutil
 import re
 from typing import Any
 
+from sphinx.addnodes import desc_annotation
+
 from cz_gym import Parameters
 from cz_gym.body.signals import Measured
 from cz_gym.camera.view import Camera
@@ -12,7 +14,7 @@ from cz_gym.camera.view import Camera
 DESCRIBED: tuple[Any, ...] = (Parameters, Camera, Measured)
 """Records whose fields are in a table of a page."""
 LONGEST = 25
-"""Longest default in a signature [characters]."""
+"""Longest default in a signature, and longest value of a constant [characters]."""
 PLACE = "Alias for field number"
 HEADING = re.compile(r"^## (.*)$")
 CODE = re.compile(r"(``.*?``)")
@@ -60,8 +62,16 @@ def exists(app: Any, domain: Any, node: Any) -> bool | None:
     return None
 
 
+def shorten(app: Any, domain: str, kind: str, content: Any) -> None:
+    """Leave out the value of a constant that is too long to read: autodoc shows those of a module's members."""
+    for node in list(content.parent.findall(desc_annotation)):
+        if node.astext().lstrip().startswith("=") and len(node.astext()) > LONGEST:
+            node.parent.remove(node)
+
+
 def setup(app: Any) -> dict[str, bool]:
     """Listen to autodoc."""
+    app.connect("object-description-transform", shorten)
     app.connect("autodoc-process-docstring", say)
     app.connect("autodoc-process-signature", sign)
     app.connect("autodoc-skip-member", skip)

@@ -191,8 +191,9 @@ TABLES: dict[str, Callable[[], list[str]]] = {
 
 DOCS = Path(__file__).parents[1]
 CONTENTS = DOCS / "_contents.md"
-"""The site's contents, which stand behind the first page: GitHub would show them as code."""
+"""The site's contents. Each part stands behind the page that it names: GitHub would show it as code there."""
 _BETWEEN = re.compile(r"(?<=<!-- table:)(?!end)([\w-]+)( -->\n).*?(?=<!-- table:end -->)", re.DOTALL)
+_BEHIND = re.compile(r"^<!-- behind (\S+) -->\n", re.MULTILINE)
 _EQUATION = re.compile(r"\[(\(\d+\))\]\(physics\.md(#eq-\d+)\)")
 
 
@@ -201,10 +202,15 @@ def filled(page: str) -> str:
     return _BETWEEN.sub(lambda found: f"{found[1]}{found[2]}" + "\n".join(TABLES[found[1]]()), page)
 
 
+def contents() -> dict[str, str]:
+    """Lists of further pages, by the page that they stand behind."""
+    _, *parts = _BEHIND.split(CONTENTS.read_text())
+    return dict(zip(parts[::2], parts[1::2], strict=True))
+
+
 def read(app: Any, name: str, source: list[str]) -> None:
-    """What the site reads in place of a page: the first one's contents behind it, links to equations as anchors."""
-    if name == app.config.root_doc:
-        source[0] += CONTENTS.read_text()
+    """Replace a page's text for the site: its contents behind it, links to equations as anchors."""
+    source[0] += contents().get(name, "")
     source[0] = _EQUATION.sub(r'<a href="physics.html\2">\1</a>', source[0])
 
 

@@ -6,6 +6,7 @@ blocks and within lines, are parsed by the program they name; shell blocks marke
 
 import importlib
 import inspect
+import json
 import re
 import runpy
 import shlex
@@ -193,6 +194,26 @@ def test_the_site_loads_nothing_from_elsewhere_and_formulas_need_no_script(tmp_p
             assert re.findall(elsewhere[file.suffix], text) == [], file
             formulas += text.count("<math")
     assert formulas > 100
+    titles = json.loads((tmp_path / "searchindex.js").read_text().removeprefix("Search.setIndex(").rstrip(")"))[
+        "alltitles"
+    ]
+    assert {"Install", "GPU", "Licence", "Rewards", "Seeds"} <= set(titles)
+    values = [page for page in (tmp_path / "docs" / "api").glob("*.html") if "functools.partial(" in page.read_text()]
+    assert values == [], "a constant's value is printed"
+
+
+def test_every_figure_is_drawn_by_the_code_and_stands_on_a_page(monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS))
+    figures = importlib.import_module("czdocs.figures")
+    text = "".join(page.read_text() for page in PAGES)
+    drawn = (
+        [f"{name}.svg" for name in figures.FIGURES] + [f"bode-{name}.png" for name in figures.BODE] + ["picture.png"]
+    )
+    for name in drawn:
+        assert (figures.FOLDER / name).stat().st_size < 100_000, f"{name}: make figures"
+        assert f"_static/{name})" in text, f"{name} stands on no page"
+    assert figures.furnace().axes[0].patches
+    assert figures.loop().axes[0].patches
 
 
 def test_the_environment_page_has_gymnasiums_headings_and_the_arguments_as_they_are():
