@@ -1,4 +1,4 @@
-"""API pages: docstrings as this project writes them, and links to names that stand on no page."""
+"""API pages: docstrings as this project writes them, and links to names that stand on no page; the link to the game."""
 
 import dataclasses
 import pkgutil
@@ -17,6 +17,8 @@ LONGEST = 25
 """Longest default in a signature, and longest value of a constant [characters]."""
 PLACE = "Alias for field number"
 HEADING = re.compile(r"^## (.*)$")
+GAME = re.compile(r"\[([^]]+)\]\([\w./]*_root/play\.html\)")
+"""Link to the page on which a visitor pulls a crystal."""
 CODE = re.compile(r"(``.*?``)")
 
 
@@ -50,6 +52,12 @@ def skip(app: Any, what: str, name: str, thing: Any, skipped: bool, options: Any
     return True if any(thing is vars(described).get(name) for described in DESCRIBED) else None
 
 
+def open_game(app: Any, docname: str, source: list[str]) -> None:
+    """Link to the game's page at the site's root: Sphinx would offer it for download."""
+    place = "../" * docname.count("/") + "play.html"
+    source[0] = GAME.sub(rf'<a href="{place}">\1</a>', source[0])
+
+
 def exists(app: Any, domain: Any, node: Any) -> bool | None:
     """Nobody is warned of a name that is there but that no page describes; a name that is not there is a warning."""
     target, within = node.get("reftarget", ""), node.get("py:module")
@@ -75,5 +83,6 @@ def setup(app: Any) -> dict[str, bool]:
     app.connect("autodoc-process-docstring", say)
     app.connect("autodoc-process-signature", sign)
     app.connect("autodoc-skip-member", skip)
+    app.connect("source-read", open_game)
     app.connect("warn-missing-reference", exists)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
