@@ -25,7 +25,7 @@ from cz_gym.env import CzEnv, CzVectorEnv
 from cz_gym.evaluation.protocol import PLANT, REWARD, STATE, VALIDATION_SEEDS, scenarios
 from cz_gym.sb3 import CzVecEnv, environment_steps
 from cz_gym.spaces import observations
-from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import require_type
 from cz_gym.support.files import write_files
 
@@ -274,12 +274,12 @@ def main(argv: list[str] | None = None) -> int:
         help="saved VecNormalize that it was trained in (default: none)",
     )
     add("--name", help="what the agent is called (default: the agent file's name)")
-    about = "what it was trained on: a scenario's name, all, FILE.py:NAME or A=0.6,B=0.4 (default: %(default)s)"
-    add("--scenario", default="randomized", help=about)
+    about = "what it was trained on: a name, all, FILE.py:NAME or A=0.6,B=0.4 (default: %(default)s)"
+    parser.add_scenario(about, "randomized")
     add("--observation", default="history", help="observation it reads (default: %(default)s)")
     add("--action", default="smooth", help="direct, smooth or rate (default: %(default)s)")
     add("--control-interval", type=float, default=5.0, help="in seconds (default: %(default)s)")
-    add("--seed", type=int, help="training seed (default: the model's)")
+    add("--seed", type=between(0, 2**63 - 1), help="training seed (default: the model's)")
     add("--out", type=Path, required=True, metavar="FILE", help="agent file to write (.onnx)")
     return parser.run(_convert, argv, "agents")
 

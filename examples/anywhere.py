@@ -18,7 +18,7 @@ from torch import nn
 from cz_gym import CzVectorEnv
 from cz_gym.agents.from_torch import save_agent
 from cz_gym.config import make_config
-from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.command_line import OneLineParser, between
 
 CHANNELS, REPEAT, GAMMA, CLIP = 73, 4, 0.99, 0.2
 
@@ -267,8 +267,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = OneLineParser("python -m cz_gym.examples.anywhere", about)
     parser.add_argument("manner", choices=LOOPS)
     parser.add_argument("--minutes", type=float, default=10.0, help="processor time (%(default)s)")
-    parser.add_argument("--crystals", type=int, default=1024, help="crystals at once (%(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="training seed (%(default)s)")
+    parser.add_argument("--crystals", type=between(1, 10**6), default=1024, help="crystals at once (%(default)s)")
+    parser.add_argument("--seed", type=between(0, 2**32 - 1), default=0, help="training seed (%(default)s)")
     parser.add_argument("--out", type=Path, metavar="FILE.onnx", help="agent file (runs/MANNER.onnx)")
     return parser.run(_main, arguments, "agents")
 

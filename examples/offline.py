@@ -22,6 +22,7 @@ from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.spaces import DRIVE_CHANNELS, drives_of
+from cz_gym.support.command_line import between
 from cz_gym.support.files import write_files
 from cz_gym.tools.datasets import main as write_datasets
 from cz_gym.tools.report.tables import markdown
@@ -182,7 +183,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
     parser = argparse.ArgumentParser("python -m cz_gym.examples.offline", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--sets", default=",".join(SETS), help="datasets (default: %(default)s)")
-    parser.add_argument("--seeds", type=int, default=SEEDS, help="training seeds (default: %(default)s)")
+    parser.add_argument("--seeds", type=between(1, 100), default=SEEDS, help="training seeds (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("runs/offline.md"), help="table (default: %(default)s)")
     given = parser.parse_args(arguments)
     torch.set_num_threads(1)  # small networks are quicker so

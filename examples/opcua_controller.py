@@ -17,6 +17,7 @@ from asyncua import Client, ua
 from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 
 from cz_gym.config import Config, make_config
+from cz_gym.evaluation.protocol import scenarios
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import CzError
 from cz_gym.tools.export.block import SETPOINT_NAMES
@@ -67,7 +68,8 @@ async def control(controller: Controller, label: str, client: Client, steps: int
 
 async def run(arguments: argparse.Namespace) -> None:
     """Connect, with encryption if the server's certificate is given, and control."""
-    config = make_config(arguments.scenario, observation="measured", action="direct", puller=arguments.puller)
+    scenario, puller = scenarios(arguments.scenario), arguments.puller
+    config = make_config(scenario, observation="measured", action="direct", puller=puller)
     controller = Controller(arguments.controller, config, arguments.compiled)
     client = Client(arguments.url)
     if arguments.operator:
@@ -96,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--controller", default="paper", metavar="NAME", help="controller, agent or agent file (%(default)s)")
     add("--compiled", action="store_true", help="as C, compiled by this machine's compiler")
     parser.add_puller("the server's")
-    add("--scenario", default="puller", metavar="NAME", help="scenario whose tuned settings it has (%(default)s)")
+    parser.add_scenario("scenario whose tuned settings it has (%(default)s)", "puller")
     add("--steps", type=between(1, 10**9), default=10**9, metavar="N", help="most steps to answer")
     add("--operator", metavar="NAME", help="user; the password is in CZ_GYM_OPERATOR_PASSWORD")
     add("--encrypt", type=Path, metavar="FILE", help="encrypt; the server's certificate.pem")

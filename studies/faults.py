@@ -21,7 +21,7 @@ import numpy as np
 from cz_gym.config import make_config
 from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.files import check_writable, write_files
 from cz_gym.support.units import HOUR, MINUTE, MM
 from cz_gym.tools.export.block import SETPOINT_NAMES, Alarm
@@ -233,8 +233,9 @@ says so.
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser("python -m studies.faults", "Blocks in compiled C under the faults of a plant.")
-    parser.add_argument("--out", type=Path, default=Path("results/faults"), metavar="FOLDER", help="%(default)s")
-    parser.add_argument("--crystals", type=int, default=CRYSTALS, metavar="N", help="test crystals (%(default)s)")
+    add = parser.add_argument
+    add("--out", type=Path, default=Path("results/faults"), metavar="FOLDER", help="%(default)s")
+    add("--crystals", type=between(1, 500), default=CRYSTALS, metavar="N", help="test crystals (%(default)s)")
     return parser.run(_main, arguments, "plant")
 
 

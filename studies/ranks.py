@@ -28,6 +28,7 @@ from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.parameters import Parameters
 from cz_gym.physics.plant import Puller, make_puller
+from cz_gym.support.command_line import between
 from cz_gym.support.files import write_files
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
 from cz_gym.tools.registry import make_controller
@@ -233,7 +234,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = StudyParser("ranks", __doc__, "results/ranks")
     parser.add_argument("controllers", nargs="*", help=f"names ({', '.join(CONTROLLERS)})")
-    parser.add_argument("--crystals", type=int, default=100, help="number of test crystals (%(default)s)")
+    parser.add_argument("--crystals", type=between(1, 500), default=100, help="number of test crystals (%(default)s)")
     return parser.run(_main, arguments)
 
 

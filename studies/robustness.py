@@ -18,6 +18,7 @@ from cz_gym.config import Config, make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.support.command_line import between
 from cz_gym.support.files import write_files
 from cz_gym.support.units import HOUR
 from cz_gym.tools.registry import make_controller
@@ -99,8 +100,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = StudyParser("robustness", __doc__, "results/robustness")
     parser.add_argument("controllers", nargs="*", help=f"names ({', '.join(CONTROLLERS)})")
-    parser.add_argument("--scenario", default="randomized", help="%(default)s")
-    parser.add_argument("--crystals", type=int, default=50, help="number of test crystals (%(default)s)")
+    parser.add_scenario("%(default)s", "randomized")
+    parser.add_argument("--crystals", type=between(1, 500), default=50, help="number of test crystals (%(default)s)")
     parser.add_argument("--hours", type=float, default=1.5, help="length of a crystal [h] (%(default)s)")
     return parser.run(_main, arguments)
 

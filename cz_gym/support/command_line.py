@@ -4,9 +4,10 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
+from decimal import Decimal, InvalidOperation
 from io import TextIOWrapper
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from gymnasium.error import DependencyNotInstalled
 
@@ -38,6 +39,16 @@ class OneLineParser(argparse.ArgumentParser):
         about = f"puller file, or the name of a shipped one: {use} (docs/extend/puller.md)"
         self.add_argument("--puller", metavar="FILE.toml", help=about)
 
+    def add_scenario(self, about: str, default: str | None = None, several: bool = False) -> None:
+        """Add the option ``--scenario``, whose text :func:`cz_gym.evaluation.protocol.scenarios` reads.
+
+        With ``several`` it gives a list, of every time that it is named and of names with commas between.
+        """
+        ways: dict[str, Any] = {"default": default, "metavar": "NAME", "help": f"{about} (cz-gym list scenarios)"}
+        if several:
+            ways |= {"type": names, "action": "extend", "metavar": "NAME[,NAME]"}
+        self.add_argument("--scenario", *(["--scenarios"] if several else []), dest="scenario", **ways)
+
     def add_cluster(self) -> None:
         """Add the option ``--cluster``."""
         about = (
@@ -57,17 +68,35 @@ class OneLineParser(argparse.ArgumentParser):
         return run_command(self.prog, lambda: body(given) or 0, extra, left)
 
 
+def names(text: str) -> list[str]:
+    """Return names with commas between, each once, for an option's ``type``; a file's name may have commas itself."""
+    file, colon, name = text.rpartition(":")
+    if Path(file if colon and "," not in name else text).is_file():
+        return [text]
+    listed = list(dict.fromkeys(name.strip() for name in text.split(",")))
+    if not all(listed):
+        raise argparse.ArgumentTypeError(f"must be names with commas between, not {text!r}")
+    return listed
+
+
 def between(least: int, most: int) -> Callable[[str], int]:
-    """Return a parser of whole numbers from ``least`` to ``most``, for an option's ``type``."""
+    """Return a parser of whole numbers from ``least`` to ``most``, for an option's ``type``.
+
+    It takes numbers as people write them: 1000000, 1_000_000, 1e6.
+    """
 
     def number(text: str) -> int:
         try:
-            value = int(text)
-        except ValueError:
-            value = least - 1
+            value = Decimal(text)
+        except InvalidOperation:
+            value = Decimal("nan")
+        if not value.is_finite():
+            raise argparse.ArgumentTypeError(f"must be a whole number such as 1000 or 1e3, not {text}")
         if not least <= value <= most:
             raise argparse.ArgumentTypeError(f"must be between {least} and {most}, not {text}")
-        return value
+        if value != (whole := int(value)):
+            raise argparse.ArgumentTypeError(f"must be a whole number, not {text}")
+        return whole
 
     return number
 

@@ -18,7 +18,7 @@ from cz_gym.evaluation.protocol import (
     user_controller,
 )
 from cz_gym.puller.file import chosen_puller
-from cz_gym.support.command_line import OneLineParser, between, relative_path, run_command
+from cz_gym.support.command_line import OneLineParser, between, names, relative_path, run_command
 from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.units import MM
 from cz_gym.tools.report.markdown import terminal
@@ -53,8 +53,9 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     add("--env", choices=TASKS, default="Cz-v0", help=about)
     about = "first N test episodes (%(default)s)"
     add("--episodes", type=between(1, EPISODES), default=EPISODES, metavar="N", help=about)
-    add("--controllers", type=_names, metavar="A,B", help='controllers and agents by name, or "all"')
-    add("--scenarios", type=_names, metavar="A,B", help="scenarios by name")
+    add("--controllers", type=names, metavar="NAME[,NAME]", help='controllers and agents by name, or "all"')
+    about = "scenarios by name; FILE.py:NAME, one of your own; FILE.csv, a log's disturbances (identify --series)"
+    parser.add_scenario(about, several=True)
     add(
         "--out",
         type=Path,
@@ -69,8 +70,6 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     add("--agent", type=_agent_file, action="append", default=[], metavar="[NAME=]FILE", help=agent_help)
     own = "controller of your own, beside the classical ones of README's table unless --controllers names some"
     add("--controller", action="append", default=[], metavar="FILE.py:NAME", help=own)
-    own = "scenario of your own, in place of others; or a log's disturbances, FILE.csv (identify --series)"
-    add("--scenario", action="append", default=[], metavar="FILE.py:NAME", help=own)
     parser.add_puller("every case runs on it, with the controllers that are designed for it")
     about = "largest deviation of the diameter that is no scrap, in the report for --puller [mm] (1)"
     add("--tolerance", type=float, metavar="MM", help=about)
@@ -81,14 +80,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     add("--overwrite", action="store_true", help="replace files of earlier or other runs")
     add("--quiet", action="store_true", help="no progress bar, no table; a bar is shown on a terminal only")
     given = parser.parse_args(argv)
+    given.own_scenarios = [name for name in given.scenario or () if ":" in name or name.endswith(".csv")]
     return given
-
-
-def _names(text: str) -> list[str]:
-    names = list(dict.fromkeys(name.strip() for name in text.split(",")))
-    if not all(names):
-        raise argparse.ArgumentTypeError(f"must be names with commas between, not {text!r}")
-    return names
 
 
 def _agent_file(text: str) -> tuple[str, Path]:
@@ -101,7 +94,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the benchmark; 0 when done, 2 for bad input, 130 when interrupted."""
     arguments = parse(argv)
     if arguments.out is None and arguments.json is None:
-        mine = [place.rpartition(":")[2] for place in (*arguments.controller, *arguments.scenario)]
+        mine = [place.rpartition(":")[2] for place in (*arguments.controller, *arguments.own_scenarios)]
         mine += [name or file.stem for name, file in arguments.agent]
         mine += [Path(arguments.puller).stem] if arguments.puller else []
         arguments.out = OWN / "-".join(dict.fromkeys(mine)) if mine else folder_of(arguments)
@@ -149,8 +142,9 @@ def cases_of(arguments: argparse.Namespace) -> list[Case]:
     graded = arguments.puller and task.graded
     if arguments.tolerance is not None and not (graded and 0.0 < arguments.tolerance <= 50.0):
         raise CzError(f"--tolerance {arguments.tolerance:g} must be up to 50 mm, beside --puller FILE.toml, of Cz-v0")
-    names = arguments.scenarios or [case.name for case in task.cases if case.default and not arguments.scenario]
-    cases = [*(find_case(name, task.cases) for name in names), *map(user_case, arguments.scenario)]
+    own = arguments.own_scenarios
+    usual = [case.name for case in task.cases if case.default] if arguments.scenario is None else arguments.scenario
+    cases = [*(find_case(name, task.cases) for name in usual if name not in own), *map(user_case, own)]
     check_apart([case.name for case in cases], "scenario")
     puller = chosen_puller(arguments.puller)
     tolerance = 0.5 * MM * (arguments.tolerance or 1.0) if graded else None
@@ -231,5 +225,5 @@ def is_partial(arguments: argparse.Namespace, contenders: Sequence[Contender], c
     usual |= set(shipped_names(arguments.env))
     usual_cases = {case for case in TASKS[arguments.env].cases if case.default}
     missing = usual - {each.name for each in contenders} or usual_cases - set(cases)
-    own = arguments.agent or arguments.controller or arguments.scenario or arguments.puller
+    own = arguments.agent or arguments.controller or arguments.own_scenarios or arguments.puller
     return bool(arguments.episodes < EPISODES or missing or own)

@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("policy", metavar="FILE", help="agent file (.onnx), or FILE.py:NAME")
     add("--env", choices=ENVIRONMENTS, default="Cz-v0", help="environment of a controller (%(default)s)")
-    add("--scenario", default="randomized", metavar="NAME", help="scenario of the crystals (%(default)s)")
+    parser.add_scenario("scenario of the crystals (%(default)s)", "randomized")
     parser.add_puller("check it there")
     return parser.run(_main, arguments, "benchmark", "nothing written")
 

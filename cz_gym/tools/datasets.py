@@ -35,7 +35,7 @@ from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import informed, rollout, settings_of
 from cz_gym.puller.file import DEFAULT, PullerFile, chosen_puller, to_toml
 from cz_gym.spaces import DRIVE_CHANNELS, drives_of, to_measured
-from cz_gym.support.command_line import OneLineParser, between
+from cz_gym.support.command_line import OneLineParser, between, names
 from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.files import check_writable
 from cz_gym.tools.identify.moves import Excited
@@ -229,7 +229,7 @@ def write(
         raise CzError(f"noise must be between 0 and 1, not {noise:g}")
     check_writable(folder := datasets_root() / place)
     if folder.exists() and not overwrite:
-        raise CzError(f"{place} exists already: overwrite it, or give another folder ({folder})")
+        raise CzError(f"{place} exists in {folder}. Use --out FOLDER (--overwrite would replace it)")
 
     def buffers(first: int) -> list[Any]:
         episodes = record(policy, config, seeds[first : first + AT_ONCE], noise)
@@ -262,8 +262,8 @@ def main(argv: list[str] | None = None) -> int:
     about = "Write Minari datasets of policies on training crystals, with noise on their drives."
     parser = OneLineParser("cz-gym data", about)
     add, about = parser.add_argument, "controllers, agents, random, operator, mixed (%(default)s)"
-    add("--policies", default="paper,lqg,mixed,operator", metavar="NAMES", help=about)
-    add("--scenarios", default="randomized", metavar="NAMES", help="(%(default)s)")
+    add("--policies", type=names, default="paper,lqg,mixed,operator", metavar="NAME[,NAME]", help=about)
+    parser.add_scenario("scenarios (randomized)", several=True)
     add("--episodes", type=between(1, len(TRAINING_SEEDS)), default=EPISODES, metavar="N", help="of each (%(default)s)")
     add("--noise", type=float, default=NOISE, metavar="X", help="highest level of the excitation (%(default)s)")
     add("--out", type=Path, metavar="FOLDER", help="instead of $MINARI_DATASETS_PATH or ~/.minari/datasets")
@@ -280,8 +280,8 @@ def _write_all(given: argparse.Namespace) -> None:
     settings: dict[str, Any] = {"overwrite": given.overwrite, "puller": puller, "scored": True}
     tasks = [
         (name, find_policy(name, make_config(scenario, None, "measured", action="direct", puller=puller)), scenario)
-        for scenario in given.scenarios.split(",")
-        for name in given.policies.split(",")
+        for scenario in given.scenario or ["randomized"]
+        for name in given.policies
     ]
     one = partial(_write_one, datasets_root().absolute(), TRAINING_SEEDS[: given.episodes], given.noise, settings)
     on_cluster = run_parallel(one, tasks, None, given.cluster, datasets_root().absolute())

@@ -18,6 +18,7 @@ from cz_gym.crystal.plant import STAGES, named
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.env import CzEnv
 from cz_gym.evaluation.metrics import metrics
+from cz_gym.evaluation.protocol import scenarios
 from cz_gym.evaluation.rollout import Playback, rollout
 from cz_gym.puller.file import chosen_puller
 from cz_gym.rendering.canvas import load
@@ -47,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "Keys: up and down change the pull speed, right and left the heater, ten times as fast with shift; Esc ends.",
     )
     add = parser.add_argument
-    add("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
+    parser.add_scenario("scenario (%(default)s)", "randomized")
     add("--seed", type=between(0, 2**31 - 1), default=1, metavar="N", help="which crystal (%(default)s)")
     add("--speed", type=between(5, 300), default=60, metavar="N", help="times faster than real time (%(default)s)")
     add(
@@ -94,8 +95,9 @@ def score(config: Config, seed: int, actions: Sequence[Action], failed: bool) ->
 
 def _play(arguments: argparse.Namespace) -> None:
     puller, pygame, stage = chosen_puller(arguments.puller), load(), arguments.stage
+    scenario, horizon = scenarios(arguments.scenario), arguments.minutes and arguments.minutes * MINUTE
     config = make_config(
-        arguments.scenario, None, "measured", horizon=arguments.minutes and arguments.minutes * MINUTE, action="rate",
+        scenario, None, "measured", horizon=horizon, action="rate",
         puller=puller, process=BODY if stage is None else CRYSTAL, stage=stage,
     )  # fmt: skip
     if sys.platform.startswith(("linux", "freebsd")) and not any(map(os.environ.get, DISPLAYS)):

@@ -246,7 +246,7 @@ def check_targets(folder: Path | None, lone: Path | None, partial: bool, overwri
     if lone and lone.is_dir():
         raise CzError(f"--json {lone} is a folder")
     if present and not overwrite:
-        raise CzError(f"{present[0]} exists: add --overwrite, or name another --out or --json")
+        raise CzError(f"{present[0]} exists. Use --out runs/NAME (--overwrite would replace it)")
     for place in filter(None, (folder, lone and lone.parent)):
         check_writable(place)
 

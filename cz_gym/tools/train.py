@@ -37,8 +37,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     which.add_argument("--seeds", type=_seeds, metavar="FIRST-LAST", help=about)
     about = "environment steps of learning (default: the recipe's, or the resumed run's)"
     add("--steps", type=between(1, 10**12), help=about)
-    about = "what to train on: a scenario's name, all, FILE.py:NAME, or A=0.6,B=0.4 (default: as for --steps)"
-    add("--scenario", help=about)
+    parser.add_scenario("what to train on: a name, all, FILE.py:NAME, or A=0.6,B=0.4 (default: as for --steps)")
     parser.add_puller("train for it, at its control interval")
     about = "field of the recipe with another value, as learning_rate=3e-4 or hidden=128,128 (cz_gym.agents.recipes)"
     add("--set", action="append", default=[], metavar="FIELD=VALUE", help=about)
@@ -130,7 +129,7 @@ def _saved_settings(resume: bool, folders: list[Path]) -> dict[str, Any]:
     """Settings of the first run to resume, empty for a new one; CzError if that is the other way round."""
     begun = [folder for folder in folders if (folder / "settings.json").exists()]
     if begun and not resume:
-        raise CzError(f"{begun[0]} holds a run already: --resume it, or name another --out")
+        raise CzError(f"{begun[0]} holds a run already. Use --resume to go on with it, or --out runs/NAME")
     return read_settings((begun or folders)[0] / "settings.json") if resume else {}
 
 
@@ -197,6 +196,10 @@ def _absolute(place: str) -> str:
 
 def _seeds(text: str) -> range:
     first, _, last = text.partition("-")
-    if not (first.isdecimal() and last.isdecimal() and 0 <= int(last) - int(first) < 1000):
+    try:
+        seeds = range(between(0, 2**63 - 1)(first), between(0, 2**63 - 1)(last) + 1)
+    except argparse.ArgumentTypeError:
+        seeds = range(0)
+    if not 0 < len(seeds) <= 1000:
         raise argparse.ArgumentTypeError(f"must be FIRST-LAST, at most 1000 seeds, not {text!r}")
-    return range(int(first), int(last) + 1)
+    return seeds

@@ -19,6 +19,7 @@ from cz_gym.body.process import BODY
 from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.evaluation.parallel import run_parallel
+from cz_gym.evaluation.protocol import scenarios
 from cz_gym.puller.file import FOLDER, PullerFile, chosen_puller
 from cz_gym.support.command_line import OneLineParser, between, relative_path
 from cz_gym.support.errors import CzError, unknown_name_message
@@ -33,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = OneLineParser("cz-gym tune", "Tune a controller within a budget.")
     add = parser.add_argument
     add("--controller", help=f"{', '.join(TUNABLE)} (with --puller: all that are searched for one)")
-    add("--scenario", help=f"scenario to tune on ({RANDOMIZED.name})")
+    parser.add_scenario(f"scenario to tune on ({RANDOMIZED.name})")
     add("--control-interval", type=float, help="time between actions [s] (5)")
     parser.add_cluster()
     parser.add_puller("search every controller that is designed for it, minutes of work")
@@ -62,20 +63,19 @@ def _tune(given: argparse.Namespace) -> None:
         raise CzError("--cluster shares the searches for a --puller between machines: one search is one task")
     if given.controller is None:
         raise CzError("name a --controller, or a --puller to design for")
-    name, known = given.scenario or RANDOMIZED.name, tunable(given)
-    scenario = find_scenario(name)
+    scenario, known = find_scenario(scenarios(given.scenario or RANDOMIZED.name)), tunable(given)
     tuned = known.get(given.controller)
     if tuned is None:
         raise CzError(unknown_name_message("controller to tune", given.controller, known))
     if tuned.process != BODY and scenario != RANDOMIZED:
-        raise CzError(f"{tuned.name} has one search: leave --scenario {name} out")
+        raise CzError(f"{tuned.name} has one search: leave --scenario {scenario.name} out")
     config = tuned.search_config(scenario, given.control_interval)
     margins = asked_margins(given, tuned, tuned.margins)
     budget = given.trials or 100, given.episodes or 100
     search = Search(tuned.name, tuned.objective(scenario), config, *budget, margins=margins)
-    path = (given.out or Path("runs/tuning")) / file_name(tuned.name, name)
+    path = (given.out or Path("runs/tuning")) / file_name(tuned.name, scenario.name)
     chosen = search.tune(path)
-    print(f"{tuned.name} on {name}: score {chosen.score:.4f} on validation crystals")
+    print(f"{tuned.name} on {scenario.name}: score {chosen.score:.4f} on validation crystals")
     for parameter, value in zip(search.objective.parameters, chosen.values, strict=True):
         print(f"  {parameter.path} = {value:.6g}")
     print(f"wrote {relative_path(path)}")

@@ -235,7 +235,7 @@ def test_files_are_replaced_by_a_full_run_or_when_told_to(tmp_path, finished, mo
     page.write_text("precious")
     for arguments in ([], ["--out", str(finished)], ["--json", str(results)], ["--out", str(tmp_path)]):
         for some in (SMALL, ["--controllers", "paper"]):
-            assert "exists: add --overwrite" in refusal([*some, *arguments])
+            assert "exists. Use --out runs/NAME (--overwrite would replace it)" in refusal([*some, *arguments])
     for folder, lone in ((tmp_path, None), (None, page)):
         with pytest.raises(ValueError, match="--overwrite"):
             check_targets(folder, lone, partial=False, overwrite=False)
@@ -289,6 +289,24 @@ def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path):
     assert report.startswith("The radius is held best by a classical controller on ")
 
 
+def test_scenarios_are_named_by_one_option_in_lists_or_again_and_again(tmp_path, monkeypatch):
+    """The older spelling of names stays accepted; names come before one's own, and a file's name may have a comma."""
+    monkeypatch.chdir(tmp_path)
+    for file in ("mine.py", "mine,too.py"):
+        Path(file).write_text(MINE)
+    for given, found in (
+        (["--scenario", "hard"], ["hard"]),
+        (["--scenarios", "hard, puller"], ["hard", "puller"]),
+        (["--scenario", "mine.py:later,hard"], ["hard", "later"]),
+        (
+            ["--scenario", "mine,too.py:later", "--scenarios", "hard", "--scenario", "puller"],
+            ["hard", "puller", "later"],
+        ),
+        ([], [case.name for case in CASES if case.default]),
+    ):
+        assert [row.name for row in benchmark.cases_of(benchmark.parse(given))] == found
+
+
 def test_rows_have_the_settings_that_their_names_say():
     assert find_case("hard").seeds(7) == range(2_000_000, 2_000_007)
     assert len(find_case("reference-b").seeds(500)) == 1
@@ -325,7 +343,7 @@ def test_one_s_own_controller_runs_beside_a_few_into_its_own_folder(tmp_path, mo
     assert capsys.readouterr().out.endswith("\nwrote runs/Still; open runs/Still/report.html\n")
     results = json.loads(Path("runs/Still/benchmark.json").read_text())["results"]["reference-b"]
     assert list(results) == ["paper", "paper-tuned", "lqg-at-0.02", "lqg-one-design", "Still"]
-    assert "runs/Still/benchmark.json exists: add --overwrite" in refusal(command)
+    assert "runs/Still/benchmark.json exists. Use --out runs/NAME" in refusal(command)
     monkeypatch.setattr(benchmark, "benchmark", lambda arguments, command: folders.append(arguments.out) or 0)
     folders = []
     benchmark.main([*ONE, "--agent", "some.onnx", "--scenario", "mine.py:later"])
@@ -388,7 +406,7 @@ def test_a_report_on_one_s_own_shows_it_and_prints_a_command_that_runs(tmp_path,
         ("--controllers", "paper,,ppo", "names with commas between"),
         ("--scenarios", "easy", "unknown scenario 'easy'; choose from randomized, hard"),
         ("--scenarios", "soon", "randomized-exact\n"),
-        ("--scenario", "hard", "must be FILE.py:NAME, not 'hard'"),
+        ("--scenario", "hard,mine.py:", "must be FILE.py:NAME, not 'mine.py:'"),
         ("--scenario", "mine.py:soon", "unknown scenario 'soon'; choose from later\n"),
         ("--agent", "nowhere.onnx", "nowhere.onnx: no such file"),
         ("--out", "mine.py/results", "not a folder"),

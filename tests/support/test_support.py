@@ -1,5 +1,6 @@
 """Files are written whole or not at all; every command answers a mistake or Ctrl-C in one line."""
 
+import argparse
 import errno
 import importlib
 import os
@@ -7,18 +8,27 @@ import re
 import subprocess
 import sys
 import tomllib
+from contextlib import suppress
+from fractions import Fraction
 from pathlib import Path
 
 import pytest
 from gymnasium.error import DependencyNotInstalled
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 import cz_gym_command
 from cz_gym import __version__
+from cz_gym.agents import shipped_names
+from cz_gym.crystal.plant import STAGES
+from cz_gym.episodes.scenarios import SCENARIOS
+from cz_gym.evaluation.protocol import CASES
 from cz_gym.support import files
-from cz_gym.support.command_line import OPTIONAL, run_command
+from cz_gym.support.command_line import OPTIONAL, between, run_command
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import LOCK, check_writable, locked, name_file_in_errors, write_files
 from cz_gym.tools import benchmark, datasets, play, tune
+from cz_gym.tools.registry import KNOWN
 from studies import speed
 from studies.paper import __main__ as paper
 from tests.conftest import ROOT, python
@@ -203,13 +213,58 @@ def test_an_interrupt_while_a_command_is_imported_is_one_line(command, tmp_path)
         (["--help"], 0, "usage: cz-gym COMMAND"),
         ([], 0, "usage: cz-gym COMMAND"),
         (["--version"], 0, f"cz-gym {__version__}\n"),
-        (["trian"], 2, "cz-gym: unknown command 'trian': did you mean 'train'? Choose from train, benchmark, tune"),
+        (["trian"], 2, "cz-gym: unknown command 'trian': did you mean 'train'? Choose from list, train, benchmark"),
         (["tune"], 2, "cz-gym tune: name a --controller, or a --puller to design for"),
     ],
 )
 def test_a_word_after_cz_gym_is_a_command(words, code, said, capfd):
     assert cz_gym_command.main(words) == code
     assert "".join(capfd.readouterr()).startswith(said)
+
+
+LEAST, MOST = -(10**3), 10**19
+WRITTEN = st.one_of(
+    st.integers(2 * LEAST, 2 * MOST).flatmap(lambda n: st.sampled_from([f"{n}", f"{n:_}", f"{n}.0", f"{n:.20e}"])),
+    st.builds("{}e{}".format, st.integers(-99, 99), st.integers(-3, 21)),
+    st.builds("{}.{}e{}".format, st.integers(0, 99), st.integers(0, 999), st.integers(-3, 19)),
+    st.from_regex(r"[-+0-9._eE ]{0,12}", fullmatch=True),
+    st.text(max_size=8),
+)
+
+
+@given(WRITTEN)
+@example("1e6")
+@example("1_000_000")
+@example("1e99999999999")
+@example("1e-99999999999")
+@example("nan")
+@example("-inf")
+@example("sNaN")
+def test_a_whole_number_is_read_as_it_is_written(text):
+    """Fractions are the oracle, but for exponents of which they would make numbers of gigabytes."""
+    _, sign, exponent = text.lower().rpartition("e")
+    value = None
+    if not sign or len(exponent) < 5:
+        with suppress(ValueError, ZeroDivisionError):
+            value = Fraction(text.replace("_", "").replace("/", "?"))
+    if value is not None and value.denominator == 1 and LEAST <= value <= MOST:
+        assert between(LEAST, MOST)(text) == value
+    else:
+        with pytest.raises(argparse.ArgumentTypeError, match=", not "):
+            between(LEAST, MOST)(text)
+
+
+@pytest.mark.parametrize("words", [["list"], ["list", "stages", "agents"]])
+def test_lists_name_everything_that_commands_take_in_80_columns(words, capsys):
+    assert cz_gym_command.main(words) == 0
+    said = capsys.readouterr().out
+    assert max(map(len, said.splitlines())) <= 80
+    names = [re.match(r"  (\S+) ", line)[1] for line in said.splitlines() if re.match(r"  \S", line)]
+    known = [*STAGES, *(name for environment in KNOWN for name in shipped_names(environment))]
+    if len(words) == 1:
+        everyone = [each.name for controllers in KNOWN.values() for each in controllers]
+        known = [*everyone, *(each.name for each in CASES), *SCENARIOS, "all", "silicon-300mm", *known]
+    assert {*known} - {"paper-ramp"} == {*names} - {"default", "germanium"}
 
 
 def test_a_reader_that_has_seen_enough_ends_the_command_quietly():

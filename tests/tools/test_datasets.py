@@ -178,7 +178,7 @@ def test_a_dataset_is_replaced_only_when_asked_for_and_never_left_half(place, mo
     assert main(command) == 0
     assert "cz/nominal/paper-v0: 1 episodes, 2,160 steps" in capsys.readouterr().out
     assert main(command) == 2
-    assert capsys.readouterr().err.count("cz/nominal/paper-v0 exists already") == 1
+    assert capsys.readouterr().err.count("cz/nominal/paper-v0 exists in ") == 1
     assert main([*command, "--overwrite"]) == 0
 
     def interrupted(*_):

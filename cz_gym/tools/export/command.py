@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from cz_gym.config import make_config
+from cz_gym.evaluation.protocol import scenarios
 from cz_gym.spaces import CLIP
 from cz_gym.support.command_line import OneLineParser, relative_path
 from cz_gym.support.errors import CzError
@@ -34,8 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add_log_options(parser)
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the files")
     parser.add_puller("its nominal values, its drives' limits, what is designed for it")
-    add("--scenario", metavar="NAME",
-        help="scenario whose tuned settings a controller has, or that a plant begins with (puller)")  # fmt: skip
+    parser.add_scenario("scenario whose tuned settings a controller has, or that a plant begins with (puller)")
     add("--real", choices=("double", "float"), default="double", help="precision of c and st (%(default)s)")
     return parser.run(_export, arguments, "plant")
 
@@ -46,7 +46,8 @@ def _export(given: argparse.Namespace) -> None:
         raise CzError("name a controller and --to c or st, or --shadow LOG; or --plant --to fmu")
     if given.scenario and given.puller and not given.plant:
         raise CzError("--scenario is for the default puller: a puller file has settings whatever the scenario")
-    config = make_config(given.scenario or "puller", observation="measured", action="direct", puller=given.puller)
+    scenario = scenarios(given.scenario or "puller")
+    config = make_config(scenario, observation="measured", action="direct", puller=given.puller)
     if given.plant:
         from .fmu import build_fmu
 

@@ -705,32 +705,12 @@ def read_log(
         notes = dict[str, int]()
         with name_file_in_errors(path):
             file = read_fields(Path(path), {column for column, _ in named.values()}, notes)
-        if (time := named["time_s"][0]) not in file and set(parts := time.split("+")) <= set(file):
-            file[time] = file[parts].fillna("").agg(" ".join, axis=1)
-        for name in (*REQUIRED, *(columns or {})):
-            if (column := named[name][0]) not in file:
-                own = next(iter(COLUMNS[name]))
-                raise CzError(
-                    f"{unknown_name_message('column', column, file)}; {name}=COLUMN:{own} says which one it is"
-                )
-        present = {name: (column, unit) for name, (column, unit) in named.items() if column in file}
-        for column in (
-            *(column for column, _ in present.values()),
-            *(each.partition("=")[0].strip() for each in where),
-        ):
-            if column in file and isinstance(file[column], pandas.DataFrame):
-                raise CzError(f"two columns are called {column!r}: give one of them another name")
-        file, (_, unit) = select_rows(file, where), present["time_s"]
+        present = find_columns(path, file, named, [*REQUIRED, *(columns or {})], where)
+        file, (time, unit) = select_rows(file, where), present.pop("time_s")
         seconds = parse_times(file[time], unit, notes)
         table = pandas.DataFrame(index=seconds.index, columns=list(COLUMNS), dtype=float).assign(time_s=seconds)
-        for name, (column, own) in list(present.items())[1:]:
-            field, (factor, added) = file[column][seconds.index], COLUMNS[name][own]
-            if name == "valid":
-                table[name] = parse_quality(field)
-            elif name == "frame_time_s":
-                table[name] = _read_times(field.fillna("").str.strip(), own)[0]
-            else:
-                table[name] = parse_numbers(field, name, notes) * factor + added
+        for name, (column, own) in present.items():
+            table[name] = parse_column(file[column][seconds.index], name, own, notes)
         notes["numbers are infinite"] = int(np.isinf(table.to_numpy()).sum())
         table = table.replace([np.inf, -np.inf], np.nan)
         _name_camera_clock(table, notes)
@@ -739,7 +719,41 @@ def read_log(
             table = table.ffill()
         return on_grid(sound_rows(table, unit, notes), notes, hold)
     except CzError as error:
-        raise CzError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
+        said = str(error)
+        raise CzError(said if said.startswith(str(path)) else f"{path}: {said}") from None
+
+
+def find_columns(
+    path: str | Path, file: Any, named: Mapping[str, tuple[str, str]], needed: Sequence[str], where: Sequence[str]
+) -> dict[str, tuple[str, str]]:
+    """Return column and unit of each standard name that the file of ``path`` has, and join a time in two columns.
+
+    Raises CzError for a ``needed`` one that it lacks, and for a column that it has twice.
+    """
+    import pandas
+
+    if (time := named["time_s"][0]) not in file and set(parts := time.split("+")) <= set(file):
+        file[time] = file[parts].fillna("").agg(" ".join, axis=1)
+    for name in needed:
+        if (column := named[name][0]) not in file:
+            has, example = ", ".join(map(str, file)), f"--column {name}=NAME:{next(iter(COLUMNS[name]))}"
+            raise CzError(f"{path} has no column {column} (it has: {has}); {example}")
+    present = {name: (column, unit) for name, (column, unit) in named.items() if column in file}
+    used = [column for column, _ in present.values()] + [each.partition("=")[0].strip() for each in where]
+    for column in used:
+        if column in file and isinstance(file[column], pandas.DataFrame):
+            raise CzError(f"two columns are called {column!r}: give one of them another name")
+    return present
+
+
+def parse_column(field: Any, name: str, unit: str, notes: dict[str, int]) -> Any:
+    """Parse the texts of a column that is not the time as numbers in the unit of its standard name."""
+    if name == "valid":
+        return parse_quality(field)
+    if name == "frame_time_s":
+        return _read_times(field.fillna("").str.strip(), unit)[0]
+    factor, added = COLUMNS[name][unit]
+    return parse_numbers(field, name, notes) * factor + added
 
 
 def _name_camera_clock(table: Any, notes: dict[str, int]) -> None:

@@ -224,7 +224,7 @@ def measured_from(benchmark: Benchmark, case: Case) -> str:
         return f"Optimality gaps are measured from {found}"
     if any(benchmark.get(case, name, "cost", "gap") for name in names):
         return f"Optimality gaps are measured from `{BOUND}` on the crystals that it met."
-    place = f"--scenario {shlex.quote(case.file)}" if case.file else f"--scenarios {case.name}"
+    place = f"--scenario {shlex.quote(case.file or case.name)}"
     return (
         f"No optimality gap: results/bounds does not have the bound for {case.name}, or it is no better than "
         f"{REFERENCE}. `python benchmark.py --slow --controllers {REFERENCE},{BOUND} {place} --out runs/bound` runs it."

@@ -14,6 +14,7 @@ from cz_gym.body.process import BODY
 from cz_gym.config import make_config
 from cz_gym.crystal.plant import STAGES, named
 from cz_gym.crystal.process import CRYSTAL
+from cz_gym.evaluation.protocol import scenarios
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import HOUR
@@ -33,7 +34,7 @@ def commands() -> OneLineParser:
     )
     add = parser.add_argument
     parser.add_puller("the puller behind the server, at its control interval")
-    add("--scenario", default="randomized", metavar="NAME", help="scenario (%(default)s)")
+    parser.add_scenario("scenario (%(default)s)", "randomized")
     add("--seed", type=between(0, 2**31 - 1), default=1, metavar="N", help="which crystal (%(default)s)")
     add("--speed", type=between(0, 10_000), default=1, metavar="N",
         help="times faster than real time; 0: every step waits for its setpoints (%(default)s)")  # fmt: skip
@@ -96,10 +97,10 @@ async def serving(arguments: argparse.Namespace, access: Any) -> AsyncIterator[t
     state = StateFile(arguments.state) if arguments.state else None
     horizon, puller, stage = arguments.hours and arguments.hours * HOUR, arguments.puller, arguments.stage
     process, kind = (BODY, Machine) if stage is None else (CRYSTAL, CrystalMachine)
+    scenario = scenarios(arguments.scenario)
     config = make_config(
-        arguments.scenario, None, "measured", horizon=horizon, action="direct", puller=puller, process=process,
-        stage=stage,
-    )  # fmt: skip
+        scenario, None, "measured", horizon=horizon, action="direct", puller=puller, process=process, stage=stage
+    )
     machine = kind(config, arguments.seed, arguments.watchdog, log, state)
     loop, queue = asyncio.get_running_loop(), asyncio.Queue[dict[str, Any]]()
     clock = Clock(
