@@ -39,18 +39,12 @@ SEEDS = TEST_SEEDS[:5]
 RIVALS = ("paper", "lqg")
 PLACE = re.compile(r'(?<=<script type="application/json" id="data">\n).*?(?=</script>)', re.DOTALL)
 """The part of the page that this command writes."""
-EPISODE = (
-    "r_c_start", "recipe_start", "recipe_duration", "recipe_amount", "drift_start", "drift_duration", "drift_amount",
-    "drift_rate", "reference_start", "reference_duration", "reference_amount", "pull_window", "pull_slew",
-    "heater_slew", "heater_step",
-)  # fmt: skip
-"""What the page's script knows of an episode, beside its series; ``randomized`` has no more."""
 SHOWN = 6
 """Steps between points of a controller's curves."""
 CAMERA_UNIT, PYROMETER_UNIT = 2e-6, 0.005
 """Units of the written noise of the ring [m] and of the pyrometer [K]."""
-PULL_UNIT, POWER_UNIT = 1e-3 * MM_PER_MIN, 10.0
-"""Units of the written pull speed [m/s] and heater power less nominal [W]."""
+PULL_UNIT = 1e-3 * MM_PER_MIN
+"""Unit of the written pull speed [m/s]."""
 
 
 def content(config: Config, seeds: Sequence[int], rivals: Sequence[str] = RIVALS) -> dict[str, Any]:
@@ -62,8 +56,7 @@ def content(config: Config, seeds: Sequence[int], rivals: Sequence[str] = RIVALS
         "speed": speed, "power": power,
         "weights": list(config.weights), "scales": list(signals.SCALES),
         "pull_tolerance": signals.PULL_TOLERANCE, "pull_memory": signals.PULL_MEMORY,
-        "camera_unit": CAMERA_UNIT, "pyrometer_unit": PYROMETER_UNIT, "pull_unit": PULL_UNIT, "power_unit": POWER_UNIT,
-        "shown": SHOWN,
+        "camera_unit": CAMERA_UNIT, "pyrometer_unit": PYROMETER_UNIT, "pull_unit": PULL_UNIT, "shown": SHOWN,
     }  # fmt: skip
     crystals = [_crystal(config, seed) for seed in seeds]
     for name in rivals:
@@ -77,12 +70,11 @@ def _crystal(config: Config, seed: int) -> dict[str, Any]:
     points = round(config.steps * config.control_interval / GRID) + 1
     series = new_series(points, config.steps + 1)
     episode = episode_from_key(config.sole_scenario, first_key(seed), series)
-    ramps = {name: getattr(episode, name) for name in EPISODE}
     noise = np.clip(np.rint(series.noise / (CAMERA_UNIT, PYROMETER_UNIT)), -127, 127)
     return {
         "seed": seed,
         "puller": pullers_of(config, [seed])[0]._asdict(),
-        "episode": {name: value if math.isfinite(value) else None for name, value in ramps.items()},
+        "episode": {name: value if math.isfinite(value) else None for name, value in episode._asdict().items()},
         "dT_i": _packed(series.interface, "<f8"),
         "camera": _packed(noise[:, 0], "i1"),
         "pyrometer": _packed(noise[:, 1], "i1"),
@@ -91,7 +83,7 @@ def _crystal(config: Config, seed: int) -> dict[str, Any]:
 
 
 def _recordings(config: Config, seeds: Sequence[int], name: str) -> list[dict[str, Any]]:
-    """How a controller grew each crystal: curves of its true radius error and drives, RMSE and cost so far."""
+    """How a controller grew each crystal: curves of its true radius error and pull speed, RMSE and cost so far."""
     run = rollout(make_controller(name, config), config, seeds)
     final, error, s = metrics(run), radius_error(run), run.signals
     limit = config.process.cost_terms(signals.Cost(config.radius_limit, 0.0, 0.0, 0.0), config.weights).radius
@@ -110,7 +102,6 @@ def _recordings(config: Config, seeds: Sequence[int], name: str) -> list[dict[st
             "cost_so_far": _packed(cost[minutes, i], "<f4"),
             "error": _packed(np.rint(error[every, i] / (1e-3 * MM)), "<i2"),
             "v_p": _packed(np.rint(s.v_p[every, i] / PULL_UNIT), "<i2"),
-            "Q_H": _packed(np.rint((s.Q_H[every, i] - run.start.Q_H[0, i]) / POWER_UNIT), "<i2"),
         }
         for i in range(len(seeds))
     ]

@@ -30,7 +30,7 @@ SLOW_DRIVES = Actuators(
 LIMITED = make_config(replace(RANDOMIZED, name="limited", actuators=SLOW_DRIVES), None, "measured", action="direct")
 SEED = play.SEEDS[0]
 KINDS = {
-    "dT_i": "<f8", "camera": "i1", "pyrometer": "i1", "error": "<i2", "v_p": "<i2", "Q_H": "<i2",
+    "dT_i": "<f8", "camera": "i1", "pyrometer": "i1", "error": "<i2", "v_p": "<i2",
     "rmse_so_far": "<f4", "cost_so_far": "<f4",
 }  # fmt: skip
 """Types of the arrays in the page's data."""
