@@ -8,7 +8,7 @@ from cz_gym.evaluation.rollout import Playback, rollout
 from studies import play
 from tests.browser.test_pages import chromium, pytestmark, resize, text, until  # noqa: F401
 from tests.conftest import ROOT
-from tests.studies.test_play import CONFIG
+from tests.studies.test_game import CONFIG
 
 WAIT_AND_SEE = """
     for (let n = 0; !over; n++) {
