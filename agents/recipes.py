@@ -347,18 +347,18 @@ def curves(runs: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> bytes:
 
     ``runs`` are the rows of ``progress.csv`` of each run, by the name of their agents.
     """
-    from cz_gym.evaluation.plots import INK, canvas, png, styles  # matplotlib is in another extra
+    from cz_gym.evaluation.plots import INK, MARKS, canvas, png, styles  # matplotlib is in another extra
 
-    figure, style = canvas(9.4, 4.6), styles([*runs])
+    figure, style = canvas(9.4, 4.6), styles([*runs], learned=[*runs])
     panels = figure.subplots(1, 2, sharey=True)
     last = next(iter(runs.values()))[0][-1]
     for axis, (column, unit, title) in zip(panels, AXES, strict=True):
         for name, several in runs.items():
             for place, rows in enumerate(several):
                 spent, error = ([float(row[each]) for row in rows] for each in (column, "validation_rmse_mm"))
-                drawn = {"color": style[name].colour, "marker": style[name].marker}
+                drawn: Any = {"color": style[name].colour, "marker": MARKS[style[name].mark]}
                 label = name if place == 0 and axis is panels[0] else None
-                axis.plot([each / unit for each in spent], error, ms=2.5, lw=1.0, label=label, **drawn)
+                axis.plot([each / unit for each in spent], error, ms=3.5, lw=1.0, label=label, **drawn)
         references = {name.removesuffix("_rmse_mm"): float(last[name]) for name in [*last][len(COLUMNS) :]}
         for name, rmse in references.items():
             axis.axhline(rmse, color=INK, lw=0.9, ls="--")

@@ -342,4 +342,6 @@ class TunedController:
     def contender(self) -> Contender:
         """The controller as a row of the benchmark."""
         alike = "name", "make", "meaning", "default", "on_puller", "quoted"
-        return Contender(observation="measured", **{each: getattr(self, each) for each in alike})
+        return Contender(
+            observation="measured", told=not self.one_for_all, **{each: getattr(self, each) for each in alike}
+        )

@@ -23,7 +23,7 @@ from cz_gym.config import Config, make_config
 from cz_gym.episodes.scenario import Interface, Scenario, Sensor
 from cz_gym.episodes.scenarios import MELT_LAYER, RANDOMIZED, RANDOMIZED_TRACED
 from cz_gym.evaluation.metrics import metrics
-from cz_gym.evaluation.plots import canvas, png, styles
+from cz_gym.evaluation.plots import MARKS, canvas, png, styles
 from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.parameters import Parameters
@@ -215,7 +215,8 @@ def figure(moved: Mapping[str, Mapping[str, Any]]) -> bytes:
     axes, looks = drawing.add_subplot(), styles(list(next(iter(moved.values()))))
     for name, look in looks.items():
         values = [found[name].rmse_mm.mean() for found in moved.values()]
-        axes.semilogy(range(len(abouts)), values, color=look.colour, marker=look.marker, ms=4, lw=0.6, label=name)
+        drawn: Any = {"color": look.colour, "marker": MARKS[look.mark], "ls": (0, look.dashes) if look.dashes else "-"}
+        axes.semilogy(range(len(abouts)), values, ms=5, lw=0.8, label=name, **drawn)
     axes.set_xticks(range(len(abouts)), [each.replace("`", "") for each in abouts], rotation=60, ha="right")
     axes.set_ylabel("radius error [mm]")
     axes.legend(fontsize=7, ncols=3, frameon=False)

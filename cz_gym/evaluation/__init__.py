@@ -24,14 +24,14 @@ def plot(run: Rollout, episode: int = 0, path: str | Path | None = None) -> Figu
 
     Needs matplotlib. IndexError for an episode that is not there, ValueError for what is no rollout.
     """
-    from .plots import COLOURS, DrawnCrystal, draw, png
+    from .plots import DrawnCrystal, draw, png
 
     require_type(Rollout, run, "cz_gym.evaluation.rollout.rollout(policy, config, seeds) makes one")
     if not -len(run.seeds) <= episode < len(run.seeds):
         raise IndexError(f"episode must be below {len(run.seeds)}, not {episode}")
     signals, dt = run.episode(episode), run.config.control_interval
     rmse = np.sqrt(np.mean(np.square(signals.r_c - signals.r_ref))) / MM
-    crystal = DrawnCrystal(f"RMSE {rmse:.3g} mm", signals, COLOURS[1], bool(run.failed[episode]))
+    crystal = DrawnCrystal(f"RMSE {rmse:.3g} mm", signals, bool(run.failed[episode]))
     figure = draw([crystal], dt, f"{run.config.scenario.name}, seed {run.seeds[episode]}")
     if path is not None:
         write_files({Path(path): png(figure)})

@@ -3,8 +3,8 @@
 import io
 import os
 from collections.abc import Callable, Sequence
-from itertools import cycle
 from typing import Any, NamedTuple
+from zlib import crc32
 
 import matplotlib
 import numpy as np
@@ -18,23 +18,48 @@ from PIL import Image
 from cz_gym.body.signals import Logged
 from cz_gym.support.units import KILO, MINUTE, MM, MM_PER_MIN
 
-from .protocol import Contender
 from .rollout import Floats
 
 if "CZ_GYM_COMMAND" in os.environ:  # the reader's matplotlibrc is for the reader's own figures
     matplotlib.rcdefaults()
 
-COLOURS = (
-    "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#4B0055", "#7F5FB0", "#8C6D1F",
-    "#444444", "#A0A000", "#8B0000", "#005F5F", "#2A2AE0", "#E0218A", "#56B4E9", "#5FBF3F",
-    "#FF00FF", "#FF004B", "#1E4B00", "#E178FF", "#E17869", "#690F2D", "#0078FF", "#8700A5",
+Vertices = tuple[tuple[float, float], ...]
+
+
+def _polygon(corners: int, inner: float = 1.0, turn: float = 90.0, across: float = 1.0) -> Vertices:
+    """Corners of a polygon in the unit circle, every other one drawn in to ``inner``; ``turn`` in degrees."""
+    angles = np.deg2rad(turn) + np.arange(corners) * 2.0 * np.pi / corners
+    radii = np.where(np.arange(corners) % 2, inner, 1.0)
+    points = zip(across * radii * np.cos(angles), radii * np.sin(angles), strict=True)
+    return tuple((round(float(x), 3), round(float(y), 3)) for x, y in points)
+
+
+MARKS = {
+    "circle": _polygon(24),
+    "square": _polygon(4, turn=45.0),
+    "triangle": _polygon(3),
+    "flag": _polygon(3, turn=270.0),
+    "pentagon": _polygon(5),
+    "cross": _polygon(8, 0.35, turn=45.0),
+    "bar": _polygon(4, turn=45.0, across=0.4),
+    "sun": _polygon(12, 0.55),
+    "diamond": _polygon(4),
+    "tall diamond": _polygon(4, across=0.5),
+    "wide diamond": ((0.0, 0.55), (1.2, 0.0), (0.0, -0.55), (-1.2, 0.0)),
+    "kite": ((0.0, 0.7), (0.75, 0.2), (0.0, -1.0), (-0.75, 0.2)),
+}
+"""Marks as polygons about the unit circle, y up: of classical controllers, then, each a kind of diamond, of agents."""
+LEARNED = ("diamond", "tall diamond", "wide diamond", "kite")
+"""Marks of agents."""
+DASHES: tuple[tuple[float, ...], ...] = (
+    (), (5.0, 2.0), (1.5, 1.5), (6.0, 2.0, 1.5, 2.0),
+    (9.0, 3.0), (3.0, 1.0), (5.0, 1.5, 1.0, 1.5, 1.0, 1.5), (2.0, 4.0),
 )  # fmt: skip
-"""Okabe and Ito's palette, safe for colour-blind readers, with more for a long table."""
-MARKERS = {
-    "o": "circle", "s": "square", "D": "diamond", "^": "triangle-up", "v": "triangle-down", "P": "cross", "*": "star",
-    "X": "x", "p": "pentagon", "h": "hexagon", "<": "triangle-left", ">": "triangle-right",
-}  # fmt: skip
-"""Matplotlib's markers with plotly's names for them."""
+"""Dashes of lines: lengths drawn and left out, in line widths; none: a solid line."""
+COLOURS = ("#310DFD", "#95210B", "#57B376", "#C79B02", "#B15DFF", "#F665C3", "#86078E", "#514B52")
+"""Colours that stay apart in every kind of colour blindness; :func:`lighter` of them does on a dark ground."""
+TRUE, RING, DRIVE = "#0072B2", "#C28A00", "#B3508A"
+"""The true crystal, the bright ring as the camera reads it, and drives; a reference is dashed, in :data:`INK`."""
 DPI = 160
 COLUMNS = 6
 """Largest number of controllers in the figure of a crystal: more would be too wide for a page."""
@@ -42,21 +67,67 @@ INK, GREY = "#222222", "#999999"
 
 
 class Style(NamedTuple):
-    """Colour and marker of a controller, the same in every figure of a run."""
+    """Look of a controller, the same in every figure."""
 
     colour: str
-    marker: str
+    mark: str
+    dashes: tuple[float, ...]
 
 
-def styles(names: Sequence[str]) -> dict[str, Style]:
-    """Return one style a controller, in turn."""
-    turns = zip(cycle(COLOURS), cycle(MARKERS))
-    return {name: Style(*style) for name, style in zip(dict.fromkeys(names), turns, strict=False)}
+def _style(colour: int, mark: str) -> Style:
+    return Style(COLOURS[colour], mark, DASHES[colour])
 
 
-def styles_of(contenders: Sequence[Contender]) -> dict[str, Style]:
-    """Return one style a contender: the user's own come first, then the quoted, agents, and the others."""
-    return styles([each.name for each in sorted(contenders, key=lambda c: (not c.own, not c.quoted, not c.learned))])
+STYLES = {
+    "paper": _style(1, "circle"),
+    "paper-tuned": _style(5, "square"),
+    "lqg-at-0.02": _style(0, "triangle"),
+    "lqg-one-design": _style(2, "flag"),
+    "gradient": _style(3, "diamond"),
+    "ppo": _style(4, "tall diamond"),
+    "sac": _style(6, "wide diamond"),
+    "ppo-plain": _style(7, "kite"),
+    "compensated": _style(1, "circle"),
+    "ring-pid": _style(5, "square"),
+    "lqg-along": _style(0, "triangle"),
+    "ring-pid-reduced": _style(2, "flag"),
+    "recipe": _style(7, "pentagon"),
+    "true-radius": _style(6, "cross"),
+    "gradient-along": _style(3, "diamond"),
+    "ppo-along": _style(4, "tall diamond"),
+    "open-loop": _style(7, "pentagon"),
+    "pid-uncompensated": _style(6, "cross"),
+    "pid-conventional": _style(4, "bar"),
+    "paper-filtered": _style(3, "sun"),
+    "lqg": _style(6, "bar"),
+    "lqg-quiet": _style(7, "sun"),
+    "lqg-at-0.02-adaptive": _style(3, "cross"),
+}
+"""Looks of those that figures show, of ``Cz-v0`` and of whole crystals; :func:`styles` has the others'."""
+
+
+def styles(names: Sequence[str], learned: Sequence[str] = ()) -> dict[str, Style]:
+    """Return the look of each controller; one that has none in :data:`STYLES` gets one that none of these has.
+
+    It depends on the name, and changes only where two would look alike; colours that no earlier name has come first.
+    Those ``learned`` get marks of agents.
+    """
+    looks: dict[str, Style] = {}
+    for name in names:
+        marks = [mark for mark in MARKS if (mark in LEARNED) == (name in learned)]
+        first = crc32(name.encode())
+        every = [_style((first + place) % len(COLOURS), mark) for mark in marks for place in range(len(COLOURS))]
+        free = [look for look in every if look not in (*STYLES.values(), *looks.values())] or every
+        colours, used = ({look[place] for look in looks.values()} for place in (0, 1))
+        free.sort(key=lambda look: (look.colour in colours, look.mark in used))
+        looks[name] = STYLES.get(name, free[0])
+    return looks
+
+
+def lighter(colour: str) -> str:
+    """Return a colour's tint for a dark ground."""
+    parts = (int(colour[place : place + 2], 16) for place in (1, 3, 5))
+    return "#" + "".join(f"{round(part + 0.35 * (255 - part)):02X}" for part in parts)
 
 
 def canvas(width: float, height: float) -> Figure:
@@ -96,16 +167,17 @@ SMOOTH = 5.0 * MINUTE
 class _Panel(NamedTuple):
     label: str
     value: Callable[[Logged], Floats]
+    colour: str
     noisy: bool = False
     """True to draw single steps pale, with their running mean on top."""
 
 
 _PANELS = (
-    _Panel("crystal radius [mm]", lambda s: s.r_c / MM),
-    _Panel("bright ring [mm]", lambda s: s.r_br / MM),
-    _Panel("pull speed [mm/min]", lambda s: s.v_p / MM_PER_MIN, noisy=True),
-    _Panel("heater power [kW]", lambda s: s.Q_H / KILO, noisy=True),
-    _Panel("melt temperature [K]", lambda s: s.T_b),
+    _Panel("crystal radius [mm]", lambda s: s.r_c / MM, TRUE),
+    _Panel("bright ring [mm]", lambda s: s.r_br / MM, RING),
+    _Panel("pull speed [mm/min]", lambda s: s.v_p / MM_PER_MIN, DRIVE, noisy=True),
+    _Panel("heater power [kW]", lambda s: s.Q_H / KILO, DRIVE, noisy=True),
+    _Panel("melt temperature [K]", lambda s: s.T_b, INK),
 )
 
 
@@ -114,7 +186,6 @@ class DrawnCrystal(NamedTuple):
 
     title: str
     signals: Logged
-    colour: str
     lost: bool
 
 
@@ -135,8 +206,8 @@ def draw(crystals: Sequence[DrawnCrystal], dt: float, title: str, tolerance: flo
     figure.suptitle(title, fontsize=10.5)
     handles: list[Any] = [
         Line2D([], [], color=INK, lw=1.2, ls="--", label="reference"),
-        Line2D([], [], color=GREY, lw=1.2, label="ring as the camera reports it"),
-        Line2D([], [], ls="none", label="in colour: true value; of a drive, its 5 min mean over single steps"),
+        Line2D([], [], color=RING, lw=1.2, alpha=0.4, label="ring as the camera reports it"),
+        Line2D([], [], color=DRIVE, lw=1.4, label="a drive's 5 min mean over single steps"),
     ]
     if tolerance:
         handles.insert(1, Patch(color=GREY, alpha=0.3, lw=0, label=f"diameter within ±{2.0 * tolerance / MM:g} mm"))
@@ -145,17 +216,17 @@ def draw(crystals: Sequence[DrawnCrystal], dt: float, title: str, tolerance: flo
 
 
 def _draw(axes: Any, crystal: DrawnCrystal, dt: float, reference: Floats) -> None:
-    signals, colour = crystal.signals, crystal.colour
+    signals = crystal.signals
     minutes = _minutes(len(signals.r_c), dt)
     axes[0].plot(_minutes(len(reference), dt), reference / MM, color=INK, lw=1.0, ls="--", zorder=3)
-    axes[1].plot(minutes, signals.r_br_measured / MM, color=GREY, lw=0.4)
+    axes[1].plot(minutes, signals.r_br_measured / MM, color=RING, lw=0.4, alpha=0.4)
     for axis, panel in zip(axes, _PANELS, strict=True):
         values = panel.value(signals)
-        axis.plot(minutes, values, color=colour, **({"lw": 0.4, "alpha": 0.4} if panel.noisy else {"lw": 1.1}))
+        axis.plot(minutes, values, color=panel.colour, **({"lw": 0.4, "alpha": 0.4} if panel.noisy else {"lw": 1.1}))
         if panel.noisy:
             window = min(max(round(SMOOTH / dt), 1), len(values))
             mean = np.convolve(values, np.full(window, 1.0 / window), "valid")
-            axis.plot(minutes[window - 1 :] - 0.5 * (window - 1) * dt / MINUTE, mean, color=colour, lw=1.4)
+            axis.plot(minutes[window - 1 :] - 0.5 * (window - 1) * dt / MINUTE, mean, color=panel.colour, lw=1.4)
         if crystal.lost:
             axis.axvline(minutes[-1], color=INK, lw=0.8, ls=":")
     axes[0].set_title(crystal.title + ", lost" * crystal.lost, fontsize=9, color=INK, fontweight="bold")

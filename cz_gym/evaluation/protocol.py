@@ -64,6 +64,8 @@ class Contender:
     """True if it stands in short tables and small figures, and beside a controller of the user's own."""
     action: str = "direct"
     """Mode of its actions (:func:`cz_gym.spaces.drives_of`)."""
+    told: bool = False
+    """True if it has settings for each scenario, and is told which one it meets."""
     own: bool = False
     """True if it comes from the user's own file: figures show it first."""
     training_seeds: tuple[int, ...] = ()

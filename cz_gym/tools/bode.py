@@ -43,16 +43,17 @@ def phase_of(values: Any) -> Any:
 
 def picture(title: str, dt: float, loops: dict[str, StateSpace]) -> bytes:
     """Draw gain and phase of the loops, by the place where they are opened, and their sensitivity, as PNG."""
-    from cz_gym.evaluation.plots import COLOURS, GREY, canvas, png
+    from cz_gym.evaluation.plots import COLOURS, DASHES, GREY, canvas, png
 
     omega = analysis.frequencies(dt)
     figure = canvas(7.0, 6.5)
     gain, phase, sensitivity = figure.subplots(3, 1, sharex=True)
-    for (at, loop), colour in zip(loops.items(), COLOURS, strict=False):
+    for (at, loop), colour, dashes in zip(loops.items(), COLOURS, DASHES, strict=False):
+        look: Any = {"color": colour, "lw": 1.2, "ls": (0, dashes) if dashes else "-"}
         values = analysis.response(loop, dt, omega)
-        gain.loglog(omega, np.abs(values), color=colour, lw=1.2, label=f"opened at the {PLACES[at]}")
-        phase.semilogx(omega, phase_of(values), color=colour, lw=1.2)
-        sensitivity.loglog(omega, 1.0 / np.abs(1.0 + values), color=colour, lw=1.2)
+        gain.loglog(omega, np.abs(values), **look, label=f"opened at the {PLACES[at]}")
+        phase.semilogx(omega, phase_of(values), **look)
+        sensitivity.loglog(omega, 1.0 / np.abs(1.0 + values), **look)
     for panel, label in ((gain, "|L| [-]"), (phase, "phase of L [deg]"), (sensitivity, "|1 / (1 + L)| [-]")):
         panel.set_ylabel(label)
         panel.grid(alpha=0.3)

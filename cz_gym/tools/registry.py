@@ -57,6 +57,7 @@ CONTROLLERS: tuple[Contender, ...] = (
             partial(_changed, tuned.adaptive, each),
             meaning=f"{each.name} with filters for weaker fluctuations too, weighted by how well they predict",
             default=each.default,
+            told=True,
         )
         for each in (_CALM, _IN_TABLE)
     ),

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,15 +22,15 @@ import pandas as pd
 from cz_gym.engine.batch import processors
 from cz_gym.evaluation.metrics import OUTSIDE, SPEED, names_of, outside
 from cz_gym.evaluation.parallel import run_parallel
-from cz_gym.evaluation.protocol import BOUND, REFERENCE, SLOW_EPISODES, Case, Contender
+from cz_gym.evaluation.protocol import BOUND, REFERENCE, SLOW_EPISODES, Case, Contender, find_case
 from cz_gym.evaluation.rollout import check_policy, rollout
 from cz_gym.evaluation.statistics import RESAMPLES, SEED, Estimate
 from cz_gym.jit import PACKAGE, compiled_sources, hash_files
 from cz_gym.support.errors import CzError, software
 from cz_gym.support.files import check_writable, name_file_in_errors, write_files
 
-from .episodes import CODE, CONTRACT, GAPS, KEYS, Benchmark, read_episodes, to_csv, values_of
-from .report.task_records import contract_hash, task_of
+from .episodes import CODE, CONTRACT, GAPS, KEYS, Benchmark, read_episodes, read_estimates, to_csv, values_of
+from .report.task_records import TASKS, contract_hash, task_of
 
 PRINTED = 1e-4
 """Relative precision of the figures in the bounds' table, five digits [-]."""
@@ -228,10 +229,10 @@ def _agree(now: pd.DataFrame, then: pd.DataFrame) -> bool:
 
 PACKAGES = ("cz-gym", "gymnasium", "numpy", "scipy", "numba", "onnxruntime")
 """Packages whose versions are recorded."""
-FACTS = ("name", "observation", "meaning", "training_seeds", "privileged", "slow", "action", "own")
+FACTS = ("name", "observation", "meaning", "training_seeds", "privileged", "slow", "action", "told", "own")
 """Fields of a contender that are recorded."""
 RESULTS, EPISODES = "benchmark.json", "episodes.csv"
-FILES = (RESULTS, EPISODES, "report.md", "report.html", "crystal.png", "pareto.png")
+FILES = (RESULTS, EPISODES, "report.md", "report.html", "result.svg", "crystal.png", "pareto.svg")
 """Everything a folder of results may hold."""
 
 
@@ -312,6 +313,41 @@ def to_json(benchmark: Benchmark, command: str) -> str:
         "provenance": _provenance(benchmark, command),
     }
     return json.dumps(data, indent=1, allow_nan=False) + "\n"
+
+
+def read_benchmark(path: Path) -> Benchmark:
+    """Read a ``benchmark.json`` back: means of the metrics that everyone has, and who met what; no signals.
+
+    Raises CzError for other files.
+    """
+    read_estimates(path, ())
+    content = json.loads(path.read_text("utf-8"))
+    results, facts = content["results"], content["provenance"]
+    task = next((each for each in TASKS.values() if {*results} <= {case.name for case in each.cases}), None)
+    if task is None:
+        raise CzError(f"{path}: scenarios of the user's own, which are not in the file")
+    known = {each.name: each for each in task.controllers()}
+    contracts = iter(facts["agents"])
+    contenders = []
+    for name, each in facts["controllers"].items():
+        seeds = tuple(each["training_seeds"])
+        trained = tuple(SimpleNamespace(contract=SimpleNamespace(**next(contracts))) for _ in seeds)
+        own = Contender(**{**each, "training_seeds": seeds, "trained": trained, "make": _not_here})
+        contenders.append(known.get(name, own))
+    everyone = [found for of in results.values() for found in of.values()]
+    metrics = [name for name in names_of(task.metrics) if all(found[name]["mean"] is not None for found in everyone)]
+    met = [
+        (case, name, "", facts["scenarios"][case]["first_seed"] + crystal)
+        for case, of in results.items() for name, found in of.items() for crystal in range(found[metrics[0]]["n"])
+    ]  # fmt: skip
+    episodes = pd.DataFrame(met, columns=[*KEYS])
+    frame, _ = read_estimates(path, metrics)
+    cases = tuple(find_case(name, task.cases) for name in results)
+    return Benchmark(cases, tuple(contenders), episodes, frame, {}, episodes.iloc[:0])
+
+
+def _not_here(config: Any) -> Any:
+    raise CzError("a controller of a file of results is not there to run")
 
 
 def _nested(benchmark: Benchmark, kind: str) -> dict[str, dict[str, dict[str, Any]]]:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from cz_gym import make_puller
 from cz_gym.baselines.analysis import open_loop
-from cz_gym.evaluation.plots import GREY, canvas
+from cz_gym.evaluation.plots import GREY, RING, TRUE, canvas
 from cz_gym.process import Floats
 from cz_gym.support.units import MINUTE, MM, MM_PER_MIN
 
@@ -17,19 +17,19 @@ from . import experiments as ex
 from .experiments import PID, Trace
 
 DEGREE = np.pi / 180.0
-BLUE, ORANGE, GREEN = "#1f5fa8", "#d1661f", "#2b8a4b"
+GREEN = "#2b8a4b"
 SHOWN = {
     "r_ref": (MM, "radius [mm]", ":", GREY, "reference"),
-    "r_c": (MM, "radius [mm]", "-", BLUE, "$r_c$ (true)"),
-    "ring": (MM, "radius [mm]", "-", ORANGE, "$r_{br}$ - bias"),
+    "r_c": (MM, "radius [mm]", "-", TRUE, "$r_c$ (true)"),
+    "ring": (MM, "radius [mm]", "-", RING, "$r_{br}$ - bias"),
     "r_tilde": (MM, r"$\tilde r$ [mm]", "--", GREEN, r"$\tilde r$ (what the controller holds)"),
-    "h_c": (MM, "$h_c$ [mm]", "-", BLUE, ""),
-    "alpha_c": (DEGREE, r"$\alpha_c$ [deg]", "-", BLUE, ""),
-    "v_p": (MM_PER_MIN, "$v_p$ [mm/min]", "-", BLUE, ""),
-    "v_g": (MM_PER_MIN, "$v_g$ [mm/min]", "-", BLUE, ""),
+    "h_c": (MM, "$h_c$ [mm]", "-", TRUE, ""),
+    "alpha_c": (DEGREE, r"$\alpha_c$ [deg]", "-", TRUE, ""),
+    "v_p": (MM_PER_MIN, "$v_p$ [mm/min]", "-", TRUE, ""),
+    "v_g": (MM_PER_MIN, "$v_g$ [mm/min]", "-", TRUE, ""),
     "T_1_ref": (1.0, "temperature [K]", "--", GREY, "$T_{1,ref}$"),
-    "T_1": (1.0, "temperature [K]", "-", BLUE, "$T_1$"),
-    "T_b": (1.0, "temperature [K]", "-", ORANGE, "$T_{bulk}$"),
+    "T_1": (1.0, "temperature [K]", "-", TRUE, "$T_1$"),
+    "T_b": (1.0, "temperature [K]", "-", RING, "$T_{bulk}$"),
 }
 """For each signal: the unit in which people read it, name of its axis, line, colour, and name in a legend."""
 
@@ -60,7 +60,7 @@ def open_loop_response(model: str) -> Figure:
     radii.legend(frameon=False, fontsize=8, loc="lower right")
     inset = radii.inset_axes((0.16, 0.55, 0.5, 0.42))
     early = (run.t >= ex.BEFORE) & (run.t <= ex.BEFORE + 300.0)
-    for signal, color in ((run.signals.r_c, BLUE), (run.signals.r_br, ORANGE)):
+    for signal, color in ((run.signals.r_c, TRUE), (run.signals.r_br, RING)):
         inset.plot((run.t[early] - ex.BEFORE) / MINUTE, (signal[early] - signal[0]) / (MM * MM), color=color)
     inset.axhline(0.0, color=GREY, linewidth=0.7)
     inset.set_ylim(-1.0, 3.0)
@@ -91,7 +91,7 @@ def frequency_responses() -> Figure:
         ("own", "our plant", {"linewidth": 3.0, "alpha": 0.45}),
         ("published", "published", {"linewidth": 1.0, "linestyle": "--"}),
     ):
-        for model, color in zip(ex.MODELS, (BLUE, ORANGE), strict=True):
+        for model, color in zip(ex.MODELS, (TRUE, RING), strict=True):
             loop = open_loop(ex.linear_model(source, model), ex.compensator(source), PID)
             for axis, curve in zip((gain, phase), _frequency(loop, omega), strict=True):
                 axis.semilogx(omega, curve, color=color, label=f"Model {model}, {name}", **line)
@@ -118,10 +118,10 @@ def case_comparison() -> Figure:
         a, b = ex.cases(model)
         column[0].set_title(f"Model {model}", fontsize=9)
         for axis, name in zip(column, ("r_tilde", "h_c", "alpha_c", "v_p"), strict=True):
-            draw(axis, a, name, ls="-", color=BLUE, label="case A")
+            draw(axis, a, name, ls="-", color=TRUE, label="case A")
             small = values(b, name)
             scaled = values(a, name)[0] + 5.0 * (small - small[0])
-            axis.plot(b.minutes, scaled, "--", color=ORANGE, label="case B, scaled by 5")
+            axis.plot(b.minutes, scaled, "--", color=RING, label="case B, scaled by 5")
             axis.set_xlim(0.0, 90.0)
         column[0].plot(a.minutes, values(a, "r_ref"), ":", color=GREY, label="reference of case A")
     axes[0, 0].legend(frameon=False, fontsize=8)

@@ -28,12 +28,14 @@ from cz_gym.support.errors import CzError
 from cz_gym.tools import benchmark, run
 from cz_gym.tools.episodes import read_episodes, values_of
 from cz_gym.tools.registry import CONTROLLERS
-from cz_gym.tools.run import check_targets
+from cz_gym.tools.report import vector
+from cz_gym.tools.report.markdown import summary
+from cz_gym.tools.run import check_targets, read_benchmark
 from tests.conftest import python
 from tests.contracts import LINEAR, facts, model_of
 from tests.observed import PLAIN
 
-FILES = ["benchmark.json", "crystal.png", "episodes.csv", "pareto.png", "report.html", "report.md"]
+FILES = ["benchmark.json", "crystal.png", "episodes.csv", "pareto.svg", "report.html", "report.md", "result.svg"]
 SMALL = ["--episodes", "3", "--scenarios", "randomized,reference-b", "--controllers", "open-loop,paper"]
 ONE = ["--scenarios", "reference-b", "--controllers", "open-loop", "--quiet"]
 
@@ -92,9 +94,16 @@ def test_the_folder_holds_every_file_and_nothing_else(finished):
     assert (finished.parent / "copy.json").read_bytes() == (finished / "benchmark.json").read_bytes()
     report = (finished / "report.md").read_text()
     assert report.startswith("No verdict: 3 crystals, ")
-    for image in finished.glob("*.png"):
-        assert image.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
-        assert f"]({image.name})" in report
+    for image, begins in (("crystal.png", b"\x89PNG\r\n\x1a\n"), ("result.svg", b"<svg "), ("pareto.svg", b"<svg ")):
+        assert (finished / image).read_bytes().startswith(begins)
+        assert f"]({image})" in report
+
+
+def test_pictures_and_tables_are_made_again_from_the_file_of_results(finished):
+    again = read_benchmark(finished / "benchmark.json")
+    for name, draw in (("result.svg", vector.result), ("pareto.svg", vector.pareto)):
+        assert vector.as_file(draw(again)) == (finished / name).read_bytes()
+    assert summary(again) in (finished / "report.md").read_text()
 
 
 @pytest.fixture(scope="module")

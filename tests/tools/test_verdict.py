@@ -3,7 +3,9 @@
 import io
 from dataclasses import replace
 from types import SimpleNamespace
+from xml.etree import ElementTree
 
+import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
@@ -11,16 +13,16 @@ from PIL import Image
 from cz_gym.baselines import OpenLoop
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.evaluation.plots import COLOURS, COLUMNS, DPI, styles_of
+from cz_gym.evaluation.plots import COLUMNS, DPI
 from cz_gym.evaluation.protocol import Case, find_case
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.statistics import Estimate
 from cz_gym.tools.episodes import ESTIMATES
 from cz_gym.tools.registry import CONTROLLERS
 from cz_gym.tools.report import tables, task_records
-from cz_gym.tools.report.figures import NAMED, draw_figures
-from cz_gym.tools.report.markdown import brief
-from cz_gym.tools.report.tables import FEWEST, best_of_each_kind, chosen
+from cz_gym.tools.report.figures import draw_figures
+from cz_gym.tools.report.markdown import brief, finding
+from cz_gym.tools.report.tables import FEWEST, NAMED, best_of_each_kind, chosen, looks_of
 from cz_gym.tools.report.task_records import body_verdict as verdict
 from cz_gym.tools.report.task_records import crystal_verdict
 from tests.observed import PLAIN
@@ -176,9 +178,39 @@ def test_figure_and_short_table_show_who_is_quoted_the_best_agents_and_one_s_own
 
 
 def test_no_two_controllers_look_alike():
-    assert len(COLOURS) >= NAMED
-    known = styles_of([who for who, _ in everyone()])
-    assert len({one.colour for one in known.values()}) == len(known) == len(everyone())
+    """Controllers that share a figure differ in colour, mark and dashes; nobody has another's look."""
+    for more in ([], [sample("mine", 50.0, own=True)]):
+        benchmark = made(NOMINAL, *everyone(), *more)
+        known = looks_of(benchmark)
+        assert len({*known.values()}) == len(known) == len(everyone()) + len(more)
+        shown = [known[each.name] for each in chosen(benchmark, NOMINAL, NAMED)]
+        assert [len({*part}) for part in zip(*shown, strict=True)] == [NAMED] * 3
+
+
+def test_a_controller_looks_the_same_whoever_takes_part():
+    both = looks_of(made(NOMINAL, *everyone()))
+    few = looks_of(made(NOMINAL, sample("gradient", 1.0, training_seeds=(0,)), sample("open-loop", 9.0)))
+    assert few == {name: both[name] for name in few}
+
+
+def test_the_finding_tells_those_who_are_told_apart_and_says_how_much_each_moves():
+    def steps(rmse, moves):
+        return {"rmse_mm": np.linspace(rmse, 1.01 * rmse, 20), "pull_step_rms_mm_per_min": [moves] * 20}
+
+    cases = [replace(find_case(name)) for name in ("randomized", "hard")]
+    who = [
+        (contender("told", told=True), steps(0.1, 0.5)), (contender("free"), steps(0.4, 0.2)),
+        (contender("bound", privileged=True), steps(0.01, 9.0)),
+        (contender("agent", training_seeds=(0,)), steps(0.2, 0.3)),
+    ]  # fmt: skip
+    assert finding(made(cases, *who)) == (
+        "Of controllers that are not told which scenario they meet, the agent `agent` holds the radius best: 0.201 and "
+        "0.201 mm on `randomized` and `hard`, against 0.402 and 0.402 mm of the classical controller `free`. Told it, "
+        "`told` has 0.101 and 0.101 mm; on `randomized` the three move the pull speed by 0.3000, 0.2000 and 0.5000 "
+        "mm/min (RMS) from sample to sample."
+    )
+    assert finding(made(cases, *who[1:])) == ""
+    assert "best, within the intervals: 0.4" in finding(made(cases, *who[:3], (who[3][0], steps(0.399, 0.3))))
 
 
 @pytest.mark.filterwarnings("error")
@@ -190,7 +222,10 @@ def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_f
         who = ["a $\\frac$ b", *(f"c{i}" for i in range(COLUMNS))]
         parts.append(rolled_out(row, [(contender(each, training_seeds=(1,)), run) for each in who]))
     figures = draw_figures(joined(parts))
-    assert set(figures) == {"crystal.png", "pareto.png"}
-    assert all(image.startswith(b"\x89PNG") for image in figures.values())
+    assert list(figures) == ["result.svg", "pareto.svg", "crystal.png"]
+    assert figures["crystal.png"].startswith(b"\x89PNG")
+    for name in ("result.svg", "pareto.svg"):
+        words = [each.text for each in ElementTree.fromstring(figures[name]).iter("{http://www.w3.org/2000/svg}text")]
+        assert who[0] in words
     inches = Image.open(io.BytesIO(figures["crystal.png"])).width / DPI
     assert 830.0 / inches * 8.0 / 72.0 > 10.0, "8 point text is too small where a page shows the figure 830 pixels wide"

@@ -157,7 +157,7 @@ def _numbers(identified: Identified) -> bytes:
     axis = figure.subplots()
     shown = [e for e in identified.estimates if e.name not in Lags._fields]
     for y, e in enumerate(shown):
-        colour = COLOURS[1] if e.informed else GREY
+        colour = COLOURS[0] if e.informed else GREY
         axis.plot([max(e.low, 0.0) / e.prior, e.high / e.prior], [y, y], color=colour, lw=2)
         axis.plot(e.value / e.prior, y, "o", color=colour)
     axis.axvline(1.0, color=INK, lw=0.8)

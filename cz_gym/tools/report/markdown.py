@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -153,12 +154,50 @@ def brief(benchmark: Benchmark) -> str:
     return summary(benchmark.only(cases, tables.chosen(benchmark, cases[0], task_of(cases[0]).quoted_rows)))
 
 
+def finding(benchmark: Benchmark) -> str:
+    """Say what was found in two sentences: the best of those not told the scenario, of each kind, and of those told.
+
+    Empty where one of the three is missing, for a puller or of whole crystals, and for a few crystals.
+    """
+    cases = tables.deciding(benchmark)[:2]
+    graded = cases[0].tolerance is not None or task_of(cases[0]).by_length
+    if graded or tables.too_few(benchmark):
+        return ""
+
+    def mean(each: Contender) -> float:
+        return sum(benchmark.mean(case, each.name, tables.RMSE.metric) for case in cases)
+
+    groups: dict[str, list[Contender]] = {"learned": [], "classical": [], "told": []}
+    for each in (each for each in benchmark.contenders if not each.bound):
+        groups["told" if each.told else "learned" if each.learned else "classical"].append(each)
+    if not all(groups.values()):
+        return ""
+    best, other, told = (min(group, key=mean) for group in groups.values())
+    best, other = sorted((best, other), key=mean)
+    plain = tables.RMSE._replace(interval=False)
+    errors = [" and ".join(plain.of(benchmark, case, each.name) for case in cases) for each in (best, other, told)]
+    steps = (tables.PULL_STEP._replace(interval=False).of(benchmark, cases[0], n.name) for n in (best, other, told))
+    pairs: Any = ([benchmark.get(case, n.name, tables.RMSE.metric) for n in (best, other)] for case in cases)
+    clear = all(ours.ends[1] < theirs.ends[0] for ours, theirs in pairs)
+    kinds = ["the agent" if each.learned else "the classical controller" for each in (best, other)]
+    return (
+        f"Of controllers that are not told which scenario they meet, {kinds[0]} `{best.name}` holds the radius "
+        f"{'best' if clear else 'best, within the intervals'}: {errors[0]} mm on "
+        f"{' and '.join(f'`{case.name}`' for case in cases)}, against {errors[1]} mm of {kinds[1]} `{other.name}`. "
+        f"Told it, `{told.name}` has {errors[2]} mm; on `{cases[0].name}` the three move the pull speed by "
+        "{}, {} and {} mm/min (RMS) from sample to sample.".format(*steps)
+    )
+
+
 def fill_in(page: str, benchmark: Benchmark) -> str:
-    """Return a page with :func:`brief` between its two markers; the page itself if it has none."""
-    first, last = (marker.format(task_of(benchmark.cases[0]).name) for marker in MARKERS)
-    before, begin, rest = page.partition(first)
-    _, end, after = rest.partition(last)
-    return f"{before}{begin}\n{brief(benchmark)}\n{end}{after}" if end else page
+    """Return a page with :func:`brief`, and :func:`finding`, between their markers, where it has these."""
+    written = {task_of(benchmark.cases[0]).name: brief(benchmark), "finding": finding(benchmark)}
+    for name, words in written.items():
+        first, last = (marker.format(name) for marker in MARKERS)
+        before, begin, rest = page.partition(first)
+        _, end, after = rest.partition(last)
+        page = f"{before}{begin}\n{words}\n{end}{after}" if end and words else page
+    return page
 
 
 def markdown(benchmark: Benchmark, command: str, figures: Iterable[str]) -> str:
@@ -166,10 +205,12 @@ def markdown(benchmark: Benchmark, command: str, figures: Iterable[str]) -> str:
     case = benchmark.cases[0]
     parts = [
         *(_verdict(benchmark) if case.tolerance is None else _for_a_grower(benchmark)),
+        *([found] if (found := finding(benchmark)) else []),
         "# Benchmark",
         *task_of(case).introduction(benchmark),
+        *(f"![{name.partition('.')[0]}]({name})" for name in figures if name == "result.svg"),
         summary(benchmark),
-        *(f"![{name.removesuffix('.png')}]({name})" for name in figures),
+        *(f"![{name.partition('.')[0]}]({name})" for name in figures if name != "result.svg"),
         "## Who took part",
         tables.markdown(tables.WHO, tables.who(benchmark.contenders), rule="---"),
         *(part for case in benchmark.cases for part in _scenario(benchmark, case)),

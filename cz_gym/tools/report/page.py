@@ -15,21 +15,18 @@ from plotly.subplots import make_subplots
 
 from cz_gym.baselines.margins import EXPLAINED as BEARS
 from cz_gym.env import CzEnv
-from cz_gym.evaluation.plots import COLUMNS, GREY, INK, MARKERS, styles_of
+from cz_gym.evaluation.plots import COLUMNS, GREY, INK
 from cz_gym.evaluation.protocol import Case
 from cz_gym.evaluation.rollout import Floats
-from cz_gym.evaluation.statistics import Estimate
 from cz_gym.support.units import HOUR, MINUTE, MM
 from cz_gym.tools.episodes import Benchmark
 from cz_gym.tools.report.task_records import Panel, task_of
 
-from . import markdown, tables
-from .figures import floor_of, lost
+from . import markdown, tables, vector
+from .figures import lost
 from .markdown import measured_from
-from .tables import PULL_STEP, RMSE, chosen
+from .tables import RMSE, chosen, looks_of
 
-LOG = {"type": "log", "exponentformat": "none"}
-"""Logarithmic axis on which plotly writes powers of ten in full, with small digits between them."""
 LONGEST = 32
 """Longest name that plots have room for [characters]."""
 
@@ -50,42 +47,6 @@ def add_menu(figure: go.Figure, cases: Sequence[Case], layouts: Sequence[Mapping
     figure.for_each_trace(lambda trace: trace.update(visible=trace.meta == 0))
     menu = {"buttons": buttons, "x": 0, "xanchor": "left", "y": 1, "yanchor": "bottom", "pad": {"b": 28}}
     figure.update_layout(updatemenus=[menu] if len(cases) > 1 else [], **(layouts[0] if layouts else {}))
-
-
-def pareto(benchmark: Benchmark) -> go.Figure:
-    """Draw mean RMSE against mean pull step RMS with 95 % intervals; who never moves the pull speed stands leftmost."""
-    figure, styles = go.Figure(), styles_of(benchmark.contenders)
-    for number, case in enumerate(benchmark.cases):
-        floor = floor_of(benchmark.only([case]))
-        for name in (each.name for each in benchmark.contenders):
-            estimates: Any = (benchmark.get(case, name, column.metric) for column in (RMSE, PULL_STEP))
-            error, activity = estimates
-            still, style = activity.mean < floor, styles[name]
-            figure.add_scatter(
-                name=plain(name),
-                meta=number,
-                x=[max(activity.mean, floor)],
-                y=[error.mean],
-                error_x={"visible": False} if still else _bars(activity),
-                error_y=_bars(error),
-                mode="markers+text",
-                text="← 0" if still else "",
-                textposition="bottom center",
-                marker={"color": style.colour, "symbol": f"{MARKERS[style.marker]}-open", "size": 10, "line_width": 2},
-                hovertemplate=f"RMSE {RMSE.text(error)} mm<br>pull step RMS {PULL_STEP.text(activity)} mm/min",
-            )
-    figure.update_xaxes(LOG, title=f"mean {PULL_STEP.heading}", nticks=4)
-    figure.update_yaxes(LOG, title=f"mean {RMSE.heading}")
-    figure.update_layout(
-        height=560, legend={"orientation": "h", "y": 0, "yref": "container", "yanchor": "bottom"}, showlegend=True
-    )
-    add_menu(figure, benchmark.cases)
-    return figure
-
-
-def _bars(estimate: Estimate) -> dict[str, Any]:
-    low, high = estimate.ends
-    return {"symmetric": False, "array": [high - estimate.mean], "arrayminus": [estimate.mean - low]}
 
 
 POINT = 45.0
@@ -162,7 +123,7 @@ def _own_look(benchmark: Benchmark, case: Case, name: str, line: str, panel: int
     titled = line == "true" and not panel
     rmse = f": {benchmark.values(case, name, RMSE.metric)[0, 0]:.3f} mm{', lost' * lost(benchmark, case, name)}"
     look = {"name": plain(name) + rmse * titled, "showlegend": titled, "legendgroup": name, **_DRAWN[line]}
-    return look | {"line": {**_DRAWN[line]["line"], "color": styles_of(benchmark.contenders)[name].colour}}
+    return look | {"line": {**_DRAWN[line]["line"], "color": looks_of(benchmark)[name].colour}}
 
 
 def _lines(panel: Panel, names: Sequence[str]) -> list[tuple[str, str, bool]]:
@@ -213,9 +174,9 @@ def page(benchmark: Benchmark, command: str) -> str:
     most = max(len(benchmark.seeds(each)) for each in benchmark.cases)
     heads, groups = task.overview(benchmark.only(tables.deciding(benchmark), tables.best_of_each_kind(benchmark)))
     parts = {
-        "style": _asset("page.css"),
+        "style": _asset("page.css") + vector.STYLE,
         "plotly": get_plotlyjs(),
-        "verdict": escape(verdict.sentence),
+        "verdict": escape(" ".join((verdict.sentence, markdown.finding(benchmark).replace("`", "")))),
         "best": _table(heads, [(f"{name} [{kind}]", *cells) for kind, rows in groups.items() for name, *cells in rows]),
         "best_note": BEST_NOTE,
         "question": "Who holds the radius best",
@@ -226,7 +187,8 @@ def page(benchmark: Benchmark, command: str) -> str:
         f"action every {config.control_interval:g} s, on {case.grown_on}.",
         "scenarios": _table(verdict.heads, verdict.rows) if verdict.rows else "",
         "tables": "\n".join(_metrics(benchmark, each, is_open=each is case) for each in benchmark.cases),
-        "pareto": _html(pareto(benchmark), "pareto"),
+        "result": vector.result(benchmark),
+        "pareto": vector.pareto(benchmark),
         "crystal": _html(crystal(benchmark), "crystal"),
         "controllers": _table(tables.WHO, tables.who(contenders), "words"),
         "command": escape(command),

@@ -8,9 +8,12 @@ from cz_gym.evaluation.statistics import Estimate
 from cz_gym.support.units import PERCENT
 
 if TYPE_CHECKING:
+    from cz_gym.evaluation.plots import Style
     from cz_gym.tools.episodes import Benchmark
 
 NOTHING = "-"
+NAMED = 8
+"""Most controllers with a look of their own in a figure."""
 FEWEST = 20
 """Least number of crystals for a verdict on a scenario with randomness."""
 Table = tuple[tuple[str, ...], list[tuple[str, ...]]]
@@ -130,6 +133,16 @@ def best_of_each_kind(benchmark: "Benchmark") -> list[Contender]:
     able = [each for each in benchmark.contenders if not each.bound]
     best = {each.knows: each.name for each in sorted(able, key=error, reverse=True)}
     return [each for each in able if each.name in best.values() or each.own]
+
+
+def looks_of(benchmark: "Benchmark") -> "dict[str, Style]":
+    """Return the look of each controller; those that figures show first have colours of their own."""
+    from cz_gym.evaluation.plots import STYLES, styles  # tables need no matplotlib
+
+    shown = [each.name for each in chosen(benchmark, deciding(benchmark)[0], NAMED)]
+    names = [each.name for each in benchmark.contenders]
+    ranked = sorted(names, key=lambda name: (name not in shown, name not in STYLES))
+    return styles(ranked, [each.name for each in benchmark.contenders if each.learned])
 
 
 def chosen(benchmark: "Benchmark", case: Case, most: int) -> list[Contender]:
