@@ -14,7 +14,7 @@ from PIL import Image
 from cz_gym import CzEnv, make_puller
 from cz_gym.camera.view import Camera
 from cz_gym.env import CzCrystalEnv
-from cz_gym.evaluation.plots import COLOURS, GREY, INK, canvas
+from cz_gym.evaluation.plots import DRIVE, GREY, INK, RING, TRUE, canvas
 from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.physics.meniscus import hurle_slope, profile, profile_scale
 from cz_gym.support.units import MINUTE, MM
@@ -22,8 +22,7 @@ from cz_gym.tools import bode
 from cz_gym.tools.registry import make_controller
 
 FOLDER = Path(__file__).parents[1] / "_static"
-ORANGE, BLUE, GREEN = COLOURS[:3]
-MELT, CRYSTAL, RING = "#F6A45C", "#B7C4CF", "#E0B000"
+MELT, CRYSTAL, HEAT = "#F6A45C", "#B7C4CF", "#D55E00"
 SETTINGS = {"svg.hashsalt": "cz", "font.size": 9, "image.composite_image": False}
 """The same text of a picture each time."""
 
@@ -48,16 +47,16 @@ def _chamber(axes: Any) -> None:
     shield = view.shield_radius / MM
     for side in (-1.0, 1.0):
         axes.add_patch(Rectangle((side * wall, -190.0), side * 30.0, 190.0 + bare, color=GREY))
-        axes.add_patch(Rectangle((side * (wall + 48.0), -180.0), side * 22.0, 230.0, color=ORANGE))
+        axes.add_patch(Rectangle((side * (wall + 48.0), -180.0), side * 22.0, 230.0, color=HEAT))
         axes.plot([side * shield, side * (wall + 20.0)], [bare, bare + 190.0], color=INK, lw=4.0)
         axes.plot(side * (r + 5.0), 3.0, "o", color=RING, ms=6.0, mec=INK, mew=0.5, zorder=5)
     away = np.array([np.sin(view.tilt), np.cos(view.tilt)])
     ring = np.array([r + 5.0, 3.0])
     lens = ring + 470.0 * away
-    axes.plot(*np.array([ring, lens]).T, color=BLUE, lw=1.3)
-    axes.plot([ring[0], wall], [ring[1], 0.92 * bare], color=BLUE, lw=1.3, ls=":")
+    axes.plot(*np.array([ring, lens]).T, color=RING, lw=1.3)
+    axes.plot([ring[0], wall], [ring[1], 0.92 * bare], color=RING, lw=1.3, ls=":")
     axes.plot(*lens, marker=(4, 0, 45.0 - np.degrees(view.tilt)), ms=20.0, color=INK)
-    axes.plot([-wall - 70.0, -wall - 185.0], [-60.0, 55.0], color=GREEN, lw=1.3, ls="--")
+    axes.plot([-wall - 70.0, -wall - 185.0], [-60.0, 55.0], color=HEAT, lw=1.3, ls="--")
     axes.annotate("", (0.0, 492.0), (0.0, 425.0), arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 1.5})
     words = (
         (0.0, 120.0, "crystal", "center"), (0.0, -95.0, "melt", "center"), (14.0, 470.0, "pull speed $v_p$", "left"),
@@ -108,10 +107,10 @@ def loop() -> Figure:
     figure = canvas(8.0, 3.3)
     axes = figure.subplots()
     boxes = {
-        "PID": (1.55, 2.0, "PID", BLUE), "drives": (3.0, 2.0, "limits of\nthe drive", GREY),
-        "meniscus": (4.6, 2.0, "meniscus\nheight $h_c$", ORANGE), "radius": (6.2, 2.0, "crystal\nradius $r_c$", ORANGE),
+        "PID": (1.55, 2.0, "PID", DRIVE), "drives": (3.0, 2.0, "limits of\nthe drive", GREY),
+        "meniscus": (4.6, 2.0, "meniscus\nheight $h_c$", TRUE), "radius": (6.2, 2.0, "crystal\nradius $r_c$", TRUE),
         "camera": (5.4, 0.35, "camera: ring $r_{br}$\nof $r_c$ and $h_c$", RING),
-        "compensator": (2.6, 0.35, "compensator\n$G_{pc}$", BLUE),
+        "compensator": (2.6, 0.35, "compensator\n$G_{pc}$", DRIVE),
     }  # fmt: skip
     for x, y, words, colour in boxes.values():
         style = {"boxstyle": "round,pad=0.02", "facecolor": "white", "edgecolor": colour, "lw": 1.6}
@@ -163,11 +162,11 @@ def crown() -> Figure:
         axes.fill_betweenx(length, -radius, radius, color=CRYSTAL, label="grown")
         for side in (-1.0, 1.0):
             axes.plot(
-                side * reference, length, color=BLUE, lw=1.2, ls="--", label="recipe's radius" if side > 0.0 else None
+                side * reference, length, color=INK, lw=1.2, ls="--", label="recipe's radius" if side > 0.0 else None
             )
         end = "held" if info["succeeded"] else f"lost after {len(rows) * env.config.control_interval / MINUTE:.0f} min"
         if not info["succeeded"]:
-            axes.plot([0.0], length[-1:], "X", color=ORANGE, ms=10.0)
+            axes.plot([0.0], length[-1:], "X", color=HEAT, ms=10.0)
         axes.set_title(f"{name}: {end}", fontsize=9)
         axes.set(xlabel="radius [mm]", ylim=(155.0, -5.0), aspect="equal")
         axes.grid(alpha=0.3)
