@@ -40,6 +40,8 @@ GAPS = {"cost": 1, "rmse_mm": 2}
 """Metrics of which optimality gaps are made, with their powers."""
 TAIL_METRICS = ("rmse_mm", "rmse_observable_mm", "max_error_mm")
 """Metrics whose worst 5 % are reported."""
+LOSSES, COST = "failure_rate", "cost"
+"""Metrics that rank controllers: the lower end of the first one's interval, then the second one's mean."""
 LARGEST = 0.95
 """Level of the quantiles that are reported of :data:`LARGEST_ERRORS` [-]."""
 LARGEST_ERRORS = ("crown_max_mm", "tail_max_mm", "max_error_mm")
@@ -48,8 +50,8 @@ ESTIMATES = ("scenario", "controller", "metric", "kind", "against", "mean", "low
 
 Kinds: "mean"; "cvar", the mean of the worst 5 % of the episodes; "quantile" at :data:`LARGEST`; "difference" of the
 means from the reference's on the same crystals; "improvement", the probability of a lower value than the reference's;
-"gap" (J - J_bound) / (J_reference - J_bound); "verdict", the difference of an agent's mean from the best classical
-controller's.
+"gap" (J - J_bound) / (J_reference - J_bound); "verdict", the difference of an agent's mean from that of the classical
+controller that ranks first.
 """
 Line = tuple[str, str, str, str, str, float, float, float, int]
 
@@ -155,16 +157,22 @@ class _Scenario:
                     yield name, metric, "gap", BOUND, gap
 
     def verdicts(self, agents: Sequence[str], rivals: Sequence[str]) -> Iterator[tuple[str, str, str, str, Estimate]]:
-        """Differences of each agent's RMSE from that of the rival with the lowest mean on the rivals' crystals."""
+        """Differences of each agent's cost and RMSE from those of the rival that ranks first on their crystals."""
         known = [name for name in self.values if name in rivals]
         if not known:
             return
         fewest = self.crystals(*known)
-        rival = min(known, key=lambda name: float(self.one(name, "rmse_mm", fewest).mean()))
+
+        def rank(name: str) -> tuple[float, float]:
+            lost = means(self.one(name, LOSSES, fewest)[:, :, None], self.resamples(fewest))[0]
+            return lost.ends[0], float(self.one(name, COST, fewest).mean())
+
+        rival = min(known, key=rank)
         for name in (each for each in self.values if each in agents):
             both = self.crystals(name, rival)
-            ours, theirs = (self.one(each, "rmse_mm", both)[:, :, None] for each in (name, rival))
-            yield name, "rmse_mm", "verdict", rival, differences(ours, theirs, self.resamples(both))[0]
+            for metric in (COST, "rmse_mm"):
+                ours, theirs = (self.one(each, metric, both)[:, :, None] for each in (name, rival))
+                yield name, metric, "verdict", rival, differences(ours, theirs, self.resamples(both))[0]
 
 
 Key = tuple[str, str, str, str]
@@ -231,6 +239,16 @@ class Benchmark:
         """Return the mean of a metric over crystals and training seeds."""
         return self._known[case.name, name, metric, "mean"].mean
 
+    def rank(self, cases: Sequence[Case], name: str) -> tuple[float, float]:
+        """Return what ranks a controller on scenarios, the lower the better: crystals lost, then cost.
+
+        Losses count by the lower end of their interval, so that a few lost crystals, which another draw might not have
+        lost, decide nothing; both are means over the scenarios.
+        """
+        lost = (self._known[case.name, name, LOSSES, "mean"].ends[0] for case in cases)
+        cost = (self.mean(case, name, COST) for case in cases)
+        return round(sum(lost) / len(cases), 9), sum(cost) / len(cases)
+
     def values(self, case: Case, name: str, metric: str) -> Floats:
         """Return a metric of every episode, shape (training seeds, crystals)."""
         return values_of(self._groups[case.name, name], [metric])[:, :, 0]
@@ -247,11 +265,19 @@ class Benchmark:
         of = self.estimates[(self.estimates["scenario"] == case.name) & (self.estimates["kind"] == "verdict")]
         return None if of.empty else str(of["against"].iloc[0])
 
-    def verdicts(self, case: Case) -> dict[str, Estimate]:
-        """Return the difference of each agent's RMSE from the rival's [mm], by agent."""
+    def verdicts(self, case: Case, metric: str = COST) -> dict[str, Estimate]:
+        """Return the difference of each agent's mean of a metric from the rival's, by agent."""
         names = [each.name for each in self.contenders]
-        found = {name: self.get(case, name, "rmse_mm", "verdict") for name in names}
+        found = {name: self.get(case, name, metric, "verdict") for name in names}
         return {name: each for name, each in found.items() if each}
+
+    def outranks(self, case: Case, agent: str) -> bool | None:
+        """Return whether an agent ranks before the rival of its verdict; None where no difference is shown."""
+        (lost, _), (rivals, _) = (self.rank([case], name) for name in (agent, str(self.rival(case))))
+        low, high = self.verdicts(case)[agent].ends
+        if lost != rivals:
+            return lost < rivals
+        return True if high < 0.0 else False if low > 0.0 else None
 
 
 # Tables as files.

@@ -16,6 +16,7 @@ from cz_gym.evaluation import protocol
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import check_writable, name_file_in_errors, write_files
+from cz_gym.support.units import PERCENT
 from cz_gym.tools.episodes import Benchmark, by_key, read_estimates
 from cz_gym.tools.registry import CONTROLLERS
 from cz_gym.tools.report.markdown import summary
@@ -31,8 +32,8 @@ BUDGETS = {"1 M": 1_000_000, "5 M": 5_000_000, "20 M": 20_000_000}
 OVERSHOOT = 1.05
 """Share of a budget that a training may take: it ends with an update, which may end later."""
 HEADS = (
-    "budget, declared", "place", "agent", "told, declared", "training seeds", "claimed RMSE [mm]", "here",
-    "lost here [%]", "contract", "hash",
+    "budget, declared", "place", "agent", "told, declared", "training seeds", "lost here [%]", "cost here",
+    f"RMSE on {protocol.CASES[0].name} here [mm]", "claimed [mm]", "contract", "hash",
 )  # fmt: skip
 DECLARED = """Steps, and what an agent was told, are what its maker declares: nothing measures them, and another maker's
 run may not repeat them. The hash is of network and declarations of the first training seed: who changes either changes
@@ -74,27 +75,25 @@ def submission(folder: Path) -> tuple[protocol.Contender, tuple[float, str]]:
 
 
 def page(benchmark: Benchmark, claims: Claims) -> str:
-    """The leaderboard in Markdown: of each budget its agents by their mean RMSE here; losses and claims beside it."""
+    """The leaderboard in Markdown: of each budget its agents by crystals lost here, then by cost; claims beside it."""
     here, cases = {each.name: each for each in benchmark.contenders if each.name in claims}, benchmark.cases
     crystals = benchmark.seeds(cases[0])
-
-    def mean(name: str, metric: str) -> float:
-        return sum(benchmark.mean(case, name, metric) for case in cases) / len(cases)
-
     lines, places, order = [], Counter[str](), [*BUDGETS, "open"]
-    for name in sorted(here, key=lambda name: (order.index(budget(here[name])), mean(name, "rmse_mm"))):
+    for name in sorted(here, key=lambda name: (order.index(budget(here[name])), benchmark.rank(cases, name))):
         spent, told = budget(here[name]), TOLD[here[name].knows]
         places[spent] += 1
         claim, contract = claims[name]
         own = RMSE.of(benchmark, cases[0], name)
         same = "the same" if contract == contract_hash(cases) else f"other: `{contract or 'unknown'}`"
-        seeds, lost = str(len(here[name].training_seeds)), f"{100.0 * mean(name, 'failure_rate'):.2f}"
+        lost = sum(benchmark.mean(case, name, "failure_rate") for case in cases) / len(cases) / PERCENT
+        figures = f"{lost:.2f}", f"{benchmark.rank(cases, name)[1]:.4f}", own, f"{claim:.3f}"
+        seeds = str(len(here[name].training_seeds))
         digest = f"`{here[name].trained[0].contract.hash[:12]}`"
-        lines.append((spent, str(places[spent]), name, told, seeds, f"{claim:.3f}", own, lost, same, digest))
+        lines.append((spent, str(places[spent]), name, told, seeds, *figures, same, digest))
     seeds = f"{crystals[0]} to {crystals[-1]}"
     about = (
-        f"Submitted agents on {len(crystals)} fresh crystals of each scenario (seeds {seeds}), by mean RMSE. "
-        f'"Claimed" and "here" are the RMSE on {cases[0].name}, from the submission and from these crystals.'
+        f"Submitted agents on {len(crystals)} fresh crystals of each scenario (seeds {seeds}), by crystals lost (the "
+        'lower end of the interval), then by cost, both means over the scenarios. "Claimed" is the submission\'s RMSE.'
     )
     beside = "Every scenario, beside classical controllers:"
     return "\n\n".join(["# Leaderboard", about, DECLARED, table(HEADS, lines), beside, summary(benchmark)]) + "\n"

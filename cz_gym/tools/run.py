@@ -303,8 +303,9 @@ def to_json(benchmark: Benchmark, command: str) -> str:
             case.name: {
                 agent: {
                     "rival": benchmark.rival(case),
-                    "rmse_mm_difference": _plain(difference),
-                    "wins": difference.ends[1] < 0.0,
+                    "cost_difference": _plain(difference),
+                    "rmse_mm_difference": _plain(benchmark.verdicts(case, "rmse_mm")[agent]),
+                    "wins": benchmark.outranks(case, agent) is True,
                 }
                 for agent, difference in benchmark.verdicts(case).items()
             }

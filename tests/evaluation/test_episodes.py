@@ -77,7 +77,7 @@ def test_different_numbers_of_episodes_meet_on_those_of_both():
         sample("paper", [1.0, 2.0, 30.0], [8.0, 4.0, 99.0]),
         sample("lqg", [0.5, 0.4, 9.0], [3.0, 1.0, 99.0]),
         sample("clairvoyant", [0.0, 0.1], [1.0, 1.0], privileged=True),
-        sample("mpc", [0.6, 0.5]),
+        sample("mpc", [0.6, 0.5], [4.0, 3.0]),
         sample("ppo", [0.4, 0.3, 9.0], training_seeds=(0,)),
         sample("seer", [0.0] * 3, training_seeds=(0,), observation="state"),
     )
@@ -92,6 +92,7 @@ def test_different_numbers_of_episodes_meet_on_those_of_both():
     # On the two episodes of all, lqg is the better rival; on its own three it would seem worse than mpc.
     assert found.rival(RANDOMIZED) == "lqg"
     assert known["ppo", "rmse_mm", "verdict"] == pytest.approx((-0.2 / 3, 3))
+    assert known["ppo", "cost", "verdict"] == pytest.approx((9.7 / 3 - 103.0 / 3, 3))
     assert list(found.verdicts(RANDOMIZED)) == ["ppo"], (
         "an agent that reads the true state is a bound, and wins nothing"
     )
@@ -147,7 +148,7 @@ def test_gaps_are_measured_from_an_earlier_bound(earlier, tmp_path, monkeypatch)
     assert data["provenance"]["gap_from_cached_episodes"] == {"randomized": 2}
     report = (tmp_path / "new" / "report.md").read_text()
     assert "`clairvoyant` of an earlier run (results/bounds), on the first 2 crystals" in report
-    command = "python benchmark.py --slow --controllers paper,clairvoyant --scenarios hard --out runs/bound"
+    command = "python benchmark.py --slow --controllers paper,clairvoyant --scenario hard --out runs/bound"
     assert f"`{command}` runs it" in report
 
 

@@ -295,7 +295,7 @@ def test_the_benchmark_needs_neither_torch_nor_stable_baselines3(tmp_path):
     )
     python("-W", "error", "-c", code)
     report = (tmp_path / "out" / "report.md").read_text()
-    assert report.startswith("The radius is held best by a classical controller on ")
+    assert report.startswith("By crystals lost, then by cost, the first is a classical controller on ")
 
 
 def test_scenarios_are_named_by_one_option_in_lists_or_again_and_again(tmp_path, monkeypatch):

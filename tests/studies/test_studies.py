@@ -116,9 +116,10 @@ def test_a_claim_stands_beside_what_fresh_crystals_show(submissions, tmp_path):
     page = (tmp_path / "leaderboard.md").read_text()
     (line,) = (line for line in page.splitlines() if line.startswith("| open |"))
     cells = [cell.strip() for cell in line.split("|")]
-    _, budget, place, name, told, seeds, claimed, here, _, contract, made, _ = cells
+    _, budget, place, name, told, seeds, lost, cost, here, claimed, contract, made, _ = cells
     assert (budget, place, name, told, seeds, claimed) == ("open", "1", "mine", "state, in training", "1", "0.013")
-    assert contract == "the same"
+    assert (lost, contract) == ("0.00", "the same")
+    assert 0.002 < float(cost) < 0.1
     assert made == f"`{agents.load(agents.MODELS / 'ppo-seed0.onnx').contract.hash[:12]}`"
     assert 0.02 < float(here.split()[0]) < 0.3
     assert "seeds 3000007 to 3000008" in page

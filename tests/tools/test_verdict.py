@@ -31,7 +31,7 @@ from tests.samples import contender, joined, made, rolled_out
 BETTER, WORSE, EITHER = Estimate(-1.0, (-2.0, -0.5), 9), Estimate(1.0, (0.5, 2.0), 9), Estimate(0.1, (-1.0, 1.0), 9)
 
 
-def line(case, name, kind, estimate, against="", metric="rmse_mm"):
+def line(case, name, kind, estimate, against="", metric="cost"):
     low, high = estimate.ci95 or (float("nan"),) * 2
     return case, name, metric, kind, against, estimate.mean, low, high, estimate.n
 
@@ -39,7 +39,7 @@ def line(case, name, kind, estimate, against="", metric="rmse_mm"):
 def differing(**scenarios):
     """Results of agents a, b, ...; each scenario gives their differences, "single" a scenario of one crystal.
 
-    The rival has an RMSE of 5 mm; b knew the plant in training.
+    The rival has a cost of 5; b knew the plant in training.
     """
     parts, lines = [], []
     who = [contender("lqg"), *(contender(agent, training_seeds=(0,)) for agent in "abc")]
@@ -49,6 +49,8 @@ def differing(**scenarios):
         crystals = 1 if name.startswith("single") else FEWEST
         case = Case(name, "nominal" if crystals == 1 else "randomized", "")
         parts.append(made(case, *((each, {"rmse_mm": [0.0] * crystals}) for each in who[: most + 1])))
+        none = Estimate(0.0, (0.0, 0.0), 9)
+        lines += [line(name, each.name, "mean", none, metric="failure_rate") for each in who[: most + 1]]
         lines.append(line(name, "lqg", "mean", Estimate(5.0, (4.0, 6.0), 9)))
         for agent, each in zip("abc", differences, strict=False):
             lines.append(line(name, agent, "mean", Estimate(5.0 + each.mean, None, 9)))
@@ -59,16 +61,16 @@ def differing(**scenarios):
     return replace(joined(parts), estimates=pd.DataFrame(lines, columns=[*ESTIMATES]))
 
 
-def test_the_sentence_says_which_kind_holds_the_radius_best_and_where():
+def test_the_sentence_says_which_kind_ranks_first_and_where():
     def said(**scenarios):
         return verdict(differing(**scenarios)).sentence
 
-    assert said(one=[BETTER]) == "The radius is held best by a learned agent on one."
-    classical = "The radius is held best by a classical controller on all 2 scenarios."
+    first = "By crystals lost, then by cost, the first is"
+    assert said(one=[BETTER]) == f"{first} a learned agent on one."
+    classical = f"{first} a classical controller on all 2 scenarios."
     assert said(one=[WORSE] * 3, two=[WORSE] * 3) == classical
     assert said(one=[WORSE], two=[WORSE, BETTER], three=[WORSE], four=[EITHER]) == (
-        "The radius is held best by a classical controller on one and three, by a learned agent on two; "
-        "on four no difference is shown."
+        f"{first} a classical controller on one and three, a learned agent on two; on four no difference is shown."
     )
     neither = "No difference is shown between classical controllers and learned agents on all 2 scenarios."
     assert said(one=[EITHER, WORSE], two=[WORSE, EITHER]) == neither
@@ -78,18 +80,35 @@ def test_the_table_has_a_row_a_scenario_with_the_best_of_each_kind():
     results = differing(one=[WORSE, BETTER, WORSE], two=[EITHER, WORSE, BETTER], three=[WORSE, EITHER, WORSE])
     heads, rows = verdict(results)[1:]
     assert heads[2::2] == (
-        "best learned from the reward [mm]",
-        "best learned, plant known in training [mm]",
-        "lowest error",
+        "best learned from the reward",
+        "best learned, plant known in training",
+        "ranks first",
     )
-    better, either, worse = "-1.000 [-2.000, -0.500]", "0.100 [-1.000, 1.000]", "1.000 [0.500, 2.000]"
-    rival = "lqg 5.000 [4.000, 6.000]"
+    better, either, worse = "-1.0000 [-2.0000, -0.5000]", "0.1000 [-1.0000, 1.0000]", "1.0000 [0.5000, 2.0000]"
+    rival = "lqg 5.0000 [4.0000, 6.0000]"
     assert rows == (
-        ("one", rival, "a 6.000", worse, "b 4.000", better, "b"),
-        ("two", rival, "c 4.000", better, "b 6.000", worse, "c"),
-        ("three", rival, "a 6.000", worse, "b 5.100", either, "no difference shown"),
+        ("one", rival, "a 6.0000", worse, "b 4.0000", better, "b"),
+        ("two", rival, "c 4.0000", better, "b 6.0000", worse, "c"),
+        ("three", rival, "a 6.0000", worse, "b 5.1000", either, "no difference shown"),
     )
     assert [each.name for each in best_of_each_kind(results)] == ["lqg", "b", "c"]
+
+
+def test_crystals_lost_rank_before_cost_and_a_few_of_them_decide_nothing():
+    """The lower end of the interval counts: one lost crystal of a hundred might have been none."""
+
+    def said(**lost):
+        rows = [(contender("lqg"), {"cost": [2.0] * 100, "failure_rate": share(lost.get("lqg", 0))})]
+        agent = contender("a", training_seeds=(0,))
+        rows += [(agent, {"cost": [1.0] * 100, "failure_rate": share(lost.get("a", 0))})]
+        found = made(Case("one", "randomized", ""), *rows)
+        return verdict(found).rows[0][-1], found.outranks(found.cases[0], "a")
+
+    def share(lost):
+        return [1.0] * lost + [0.0] * (100 - lost)
+
+    assert said() == said(a=1) == said(a=10, lqg=20) == ("a", True)
+    assert said(a=10) == ("lqg", False)
 
 
 def test_a_single_crystal_does_not_count_beside_others():
@@ -116,11 +135,12 @@ def test_controllers_that_lose_equally_few_crystals_are_named_together(monkeypat
     case = Case("crown", "randomized", "", process=CRYSTAL, stage="crown")
     losses = zip("abcd", (0.1, 0.0, 0.0, 0.0), (1.0, 3.0, 2.0, 4.0), strict=True)
     figures = [
-        (contender(name), {"failure_rate": [lost] * FEWEST, "rmse_mm": [rmse] * FEWEST}) for name, lost, rmse in losses
+        (contender(name), {"failure_rate": [lost] * FEWEST, "cost": [cost] * FEWEST}) for name, lost, cost in losses
     ]
     monkeypatch.setattr(task_records, "_plain", lambda column, benchmark, case, name: f"{name}'s")
     assert crystal_verdict(made(case, *figures)).sentence.startswith(
-        "b, c and d lose the fewest crystals; of them c, which loses c's % of crown, has the least error in the crown; "
+        "b, c and d lose the fewest crystals, as far as the intervals tell; of them c, which loses c's % of crown, has "
+        "the lowest cost; "
     )
     few = [(who, {name: each[:1] for name, each in values.items()}) for who, values in figures]
     assert crystal_verdict(made(case, *few)).sentence.startswith("No verdict: 1 crystal, ")
@@ -139,12 +159,12 @@ def test_an_agent_stands_with_those_that_were_told_as_much_as_the_most_told_of_i
 
 
 AGENTS = {"gradient": 0.05, "ppo": 0.06, "sac": 0.2, "ppo-plain": 0.3}
-"""Shipped agents with their RMSE [mm], as on the test crystals."""
+"""Shipped agents with made-up costs."""
 NOMINAL = find_case("nominal")
 
 
-def sample(name, rmse, **facts):
-    return contender(name, **facts), {"rmse_mm": [rmse]}
+def sample(name, cost, **facts):
+    return contender(name, **facts), {"cost": [cost]}
 
 
 def names(contenders):
@@ -153,7 +173,7 @@ def names(contenders):
 
 def everyone():
     """The default table: classical controllers of the registry, and the shipped agents."""
-    classical = [(each, {"rmse_mm": [0.1]}) for each in CONTROLLERS if each.default]
+    classical = [(each, {"cost": [0.1]}) for each in CONTROLLERS if each.default]
     return classical + [sample(*each, training_seeds=(0,)) for each in AGENTS.items()]
 
 

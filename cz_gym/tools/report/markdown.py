@@ -4,6 +4,8 @@ import shlex
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import lru_cache
+from shutil import get_terminal_size
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -289,13 +291,17 @@ def _training_seeds(benchmark: Benchmark, case: Case, pooled: Sequence[str]) -> 
 
 
 def terminal(benchmark: Benchmark) -> str:
-    """Return a short table a scenario, RMSE with its interval, then means, and the verdict or the recommendation."""
+    """Return a short table a scenario, and the verdict or the recommendation, in lines of the terminal's width."""
     task, graded = task_of(benchmark.cases[0]), benchmark.cases[0].tolerance is not None
-    verdict = task.verdict(benchmark, tables.RMSE._replace(interval=False))
+    verdict = task.verdict(benchmark, tables.COST._replace(interval=False))
     parts = [_short(benchmark, case) for case in benchmark.cases]
-    parts += [verdict.sentence] if verdict.rows or not graded else []
+    parts += [_filled(verdict.sentence)] if verdict.rows or not graded else []
     parts += [_aligned(verdict.heads, verdict.rows)] if verdict.rows else []
-    return "\n\n".join(parts + ([recommendation(benchmark)] if graded else []))
+    return "\n\n".join(parts + ([_filled(recommendation(benchmark))] if graded else []))
+
+
+def _filled(text: str) -> str:
+    return fill(text, get_terminal_size().columns, break_on_hyphens=False, break_long_words=False)
 
 
 def _short(benchmark: Benchmark, case: Case) -> str:
@@ -310,12 +316,24 @@ def _short(benchmark: Benchmark, case: Case) -> str:
         ]
         names = ("controller", *(column.heading for column in columns))
         heads, *lines = (tuple(line[place] for place in told) for line in (names, *full))
-    return f"{case.name} ({tables.crystals(len(benchmark.seeds(case)))}){grown_on}\n{_aligned(heads, lines)}"
+    heading = _filled(f"{case.name} ({tables.crystals(len(benchmark.seeds(case)))}){grown_on}")
+    return f"{heading}\n{_aligned(heads, lines)}"
 
 
 def _aligned(heads: Sequence[str], lines: Iterable[tuple[str, ...]]) -> str:
-    """A table in columns of characters, its units in a line of their own."""
+    """A table in columns of characters, its units in a line of their own.
+
+    Columns that the terminal has no room for follow below, beside the names again.
+    """
     grid = [*zip(*(head.rstrip("]").partition(" [")[::2] for head in heads), strict=True), *lines]
-    widths = [max(map(len, column)) for column in zip(*grid, strict=True)]
-    padded = ((f"  {name:<{widths[0]}}", *map(str.rjust, cells, widths[1:])) for name, *cells in grid)
-    return "\n".join("  ".join(cells).rstrip() for cells in padded)
+    names, *columns = zip(*grid, strict=True)
+    first = 2 + max(map(len, names))
+    blocks, room = [[f"  {name}".ljust(first) for name in names]], get_terminal_size().columns - first
+    for column in columns:
+        width = 2 + max(map(len, column))
+        if width > room and len(blocks[-1][0]) > first:
+            blocks.append([f"  {name}".ljust(first) for name in names])
+            room = get_terminal_size().columns - first
+        blocks[-1] = [line + cell.rjust(width) for line, cell in zip(blocks[-1], column, strict=True)]
+        room -= width
+    return "\n\n".join("\n".join(line.rstrip() for line in block) for block in blocks)

@@ -49,6 +49,7 @@ class Column(NamedTuple):
 RMSE = Column("rmse_mm", "RMSE [mm]", 3)
 FAILURES = Column("failure_rate", "failures [%]", 2, PERCENT)
 PULL_STEP = Column("pull_step_rms_mm_per_min", "pull step RMS [mm/min]", 4)
+COST = Column("cost", "cost", 4)
 RETURN = Column("return", "return", 0)
 HEATER_STEP = Column("heater_step_rms_kw", "heater step RMS [kW]", 3)
 MEAN_PULL = Column("mean_pull_within_3pct", "30 min mean pull within 3 % [%]", 1, PERCENT)
@@ -125,13 +126,10 @@ def too_few(benchmark: "Benchmark") -> str:
 
 
 def best_of_each_kind(benchmark: "Benchmark") -> list[Contender]:
-    """Return who has the lowest mean RMSE of those that knew the same, and the user's own; bounds left out."""
-
-    def error(one: Contender) -> float:
-        return sum(benchmark.mean(case, one.name, RMSE.metric) for case in deciding(benchmark))
-
-    able = [each for each in benchmark.contenders if not each.bound]
-    best = {each.knows: each.name for each in sorted(able, key=error, reverse=True)}
+    """Return who ranks first of those that knew the same, and the user's own; bounds left out."""
+    able, cases = [each for each in benchmark.contenders if not each.bound], deciding(benchmark)
+    ranked = sorted(able, key=lambda each: benchmark.rank(cases, each.name), reverse=True)
+    best = {each.knows: each.name for each in ranked}
     return [each for each in able if each.name in best.values() or each.own]
 
 
@@ -149,9 +147,9 @@ def chosen(benchmark: "Benchmark", case: Case, most: int) -> list[Contender]:
     """Return at most ``most`` of the controllers, in their order, for a figure that has no room for all.
 
     Preferred are the reference, the user's own, the best agent, quoted controllers, other agents, other controllers,
-    bounds; within a group those of a lower mean RMSE on the scenario.
+    bounds; within a group those that rank first on the scenario.
     """
-    ranked = sorted(benchmark.contenders, key=lambda each: benchmark.mean(case, each.name, RMSE.metric))
+    ranked = sorted(benchmark.contenders, key=lambda each: benchmark.rank([case], each.name))
     learned = [each.name for each in ranked if each.learned and not each.bound]
 
     def place(each: Contender) -> tuple[bool, ...]:

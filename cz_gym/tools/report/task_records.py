@@ -31,6 +31,7 @@ from cz_gym.tools import registry
 from cz_gym.tools.episodes import Benchmark
 
 from .tables import (
+    COST,
     FAILURES,
     HEATER_STEP,
     MEAN_PULL,
@@ -125,19 +126,20 @@ BODY_DRIVES = (
     HEATER_STEP,
     Column("time_at_limits", "at the drives' limits [%]", 1, PERCENT),
     Column("growth_rate_rms_mm_per_min", "growth rate RMS [mm/min]", 3),
-    Column("cost", "cost", 4),
+    COST,
     RETURN,
     Column(SPEED, "compute [us/step]", 2),
 )
 BODY_SHORT = (
-    RMSE,
+    FAILURES._replace(heading="lost [%]", interval=False),
+    COST,
+    RMSE._replace(interval=False),
     Column("max_error_mm", "max [mm]", 2, interval=False),
-    Column("within_half_mm", "in 0.5 mm [%]", 1, PERCENT, interval=False),
     PULL_STEP._replace(heading="pull step [mm/min]", interval=False),
     HEATER_STEP._replace(heading="heater step [kW]", interval=False),
-    FAILURES._replace(interval=False),
+    Column("within_half_mm", "in 0.5 mm [%]", 1, PERCENT, interval=False),
     Column(SPEED, "compute [us/step]", 2),
-    RMSE._replace(heading=f"RMSE less {REFERENCE}'s [mm]", kind="difference"),
+    COST._replace(heading=f"cost less {REFERENCE}'s", kind="difference"),
 )
 """Columns on a terminal."""
 
@@ -145,7 +147,7 @@ BODY_SHORT = (
 def body_overview(benchmark: Benchmark) -> Groups:
     """Return heads, and rows by what contenders knew: RMSE and failures on each scenario, drives on the first."""
     cases, first = benchmark.cases, benchmark.cases[0]
-    alone = [column._replace(interval=False) for column in (MEAN_PULL, PULL_STEP, HEATER_STEP, RETURN)]
+    alone = [column._replace(interval=False) for column in (COST, MEAN_PULL, PULL_STEP, HEATER_STEP)]
     groups: dict[str, list[tuple[str, ...]]] = {}
     for each in benchmark.contenders:
         name = each.name
@@ -157,10 +159,11 @@ def body_overview(benchmark: Benchmark) -> Groups:
     return (*heads, FAILURES.heading), groups
 
 
-def body_verdict(benchmark: Benchmark, column: Column = RMSE) -> Verdict:
-    """Compare the best classical controller of each scenario with the learned agents, bounds left out.
+def body_verdict(benchmark: Benchmark, column: Column = COST) -> Verdict:
+    """Compare the classical controller that ranks first on each scenario with the learned agents, bounds left out.
 
-    ``column`` has the form of the errors. A few crystals of a random scenario give no verdict.
+    Crystals lost rank first, then cost (:meth:`Benchmark.rank`); ``column`` has the form of the costs. A few crystals
+    of a random scenario give no verdict.
     """
     groups: dict[str, list[str]] = {}
     for each in benchmark.contenders:
@@ -173,40 +176,41 @@ def body_verdict(benchmark: Benchmark, column: Column = RMSE) -> Verdict:
         return Verdict("No classical controller took part in this run to compare the agents with.")
     if few := too_few(benchmark):
         return Verdict(few)
-    heads = ["scenario", "best classical [mm]"]
+    heads = ["cost", "best classical"]
     for group in groups:
-        heads += [f"best {group} [mm]", "difference [mm]"]
+        heads += [f"best {group}", "difference"]
     where: dict[str, list[str]] = {"a classical controller": [], "a learned agent": [], "": []}
     rows = []
     for case in cases:
         winner, row = _compare_kinds(benchmark, case, groups, column)
         where[winner].append(case.name)
         rows.append(row)
-    return Verdict(_sentence(where), (*heads, "lowest error"), tuple(rows))
+    return Verdict(_sentence(where), (*heads, "ranks first"), tuple(rows))
 
 
 def _compare_kinds(
     benchmark: Benchmark, case: Case, groups: Mapping[str, Sequence[str]], column: Column
 ) -> tuple[str, tuple[str, ...]]:
-    """Return the kind with the lowest error on a scenario, "" for neither, and the scenario's row."""
+    """Return the kind that ranks first on a scenario, "" for neither, and the scenario's row."""
     rival, differences = str(benchmark.rival(case)), benchmark.verdicts(case)
+    ahead = {name: benchmark.outranks(case, name) for name in differences}
 
-    def error(name: str) -> float:
-        return benchmark.mean(case, name, RMSE.metric)
+    def rank(name: str) -> tuple[float, float]:
+        return benchmark.rank([case], name)
 
-    won = [name for name, each in differences.items() if each.ends[1] < 0.0]
-    best = min(won, key=error) if won else rival
+    won = [name for name, before in ahead.items() if before]
+    best = min(won, key=rank) if won else rival
     row = [f"{rival} {column.of(benchmark, case, rival)}"]
     for names in groups.values():
-        name = min(names, key=error)
-        row += [f"{name} {column.of(benchmark, case, name)}", RMSE.text(differences[name])]
-    clear = won or all(each.ends[0] > 0.0 for each in differences.values())
+        name = min(names, key=rank)
+        row += [f"{name} {column.of(benchmark, case, name)}", COST.text(differences[name])]
+    clear = won or all(before is False for before in ahead.values())
     winner = "a learned agent" if won else "a classical controller" if clear else ""
     return winner, (case.name, *row, best if clear else "no difference shown")
 
 
 def _sentence(where: Mapping[str, Sequence[str]]) -> str:
-    """Say on which scenarios each kind of controller holds the radius best, "" for neither."""
+    """Say on which scenarios each kind of controller ranks first, "" for neither."""
     total = sum(map(len, where.values()))
 
     def listed(names: Sequence[str]) -> str:
@@ -214,10 +218,11 @@ def _sentence(where: Mapping[str, Sequence[str]]) -> str:
         return f"all {total} scenarios" if len(names) == total > 1 else some
 
     places = {kind: listed(names) for kind, names in where.items() if names}
-    held = ", ".join(f"by {kind} on {place}" for kind, place in places.items() if kind)
-    if not held:
+    first = ", ".join(f"{kind} on {place}" for kind, place in places.items() if kind)
+    if not first:
         return f"No difference is shown between classical controllers and learned agents on {places['']}."
-    return f"The radius is held best {held}" + (f"; on {places['']} no difference is shown." if "" in places else ".")
+    neither = f"; on {places['']} no difference is shown" if "" in places else ""
+    return f"By crystals lost, then by cost, the first is {first}{neither}."
 
 
 INTERVALS = (
@@ -240,9 +245,10 @@ def body_introduction(benchmark: Benchmark) -> list[str]:
         f"{config.control_interval:g} s control, on {case.grown_on}.",
         f"{INTERVALS} After a failure the radius error counts {config.radius_limit / MM:.3g} mm to "
         f"the end; drives, growth rate and ground-off are those of the time before it. {_none_lost(benchmark)} The "
-        "verdict compares radius errors alone: who moves the pull speed more can have less. docs/controllers/bounds.md "
-        "compares at equal pull steps, docs/benchmark.md has the protocol and every formula.",
-        "RMSE of the true radius [mm] with 95 % interval and failures on each scenario, pull steps on the first.",
+        "verdict ranks by crystals lost (the lower end of the interval), then by cost, which counts radius error and "
+        "moves. docs/controllers/bounds.md compares radius errors at equal pull steps, docs/benchmark.md has the "
+        "protocol and every formula.",
+        "RMSE of the true radius [mm] with 95 % interval and failures on each scenario, cost and moves on the first.",
     ]
 
 
@@ -262,7 +268,7 @@ CRYSTAL_ERROR = (
 )  # fmt: skip
 CRYSTAL_DRIVES = (
     HOURS, ENERGY, Column("dopant_spread", "dopant's spread [%]", 1, PERCENT), PULL_STEP, HEATER_STEP, RMSE,
-    Column("cost", "cost", 4), RETURN, Column(SPEED, "compute [us/step]", 2),
+    COST, RETURN, Column(SPEED, "compute [us/step]", 2),
 )  # fmt: skip
 CRYSTAL_SHORT = tuple(
     column._replace(interval=False)
@@ -294,24 +300,21 @@ def _plain(column: Column, benchmark: Benchmark, case: Case, name: str) -> str:
 
 
 def crystal_verdict(benchmark: Benchmark, column: Column = RMSE) -> Verdict:
-    """Say which controller that reads sensors loses the fewest crystals, and has the least error in the crown."""
+    """Say which controller that reads sensors ranks first: crystals lost, then cost (:meth:`Benchmark.rank`)."""
     able = [each.name for each in benchmark.contenders if not each.bound]
     if not able:
         return Verdict("No controller that reads sensors took part in this run.")
     if few := too_few(benchmark):
         return Verdict(few)
     crown, body = grows(benchmark, 0), grows(benchmark, 1)
-
-    def losses(name: str) -> float:
-        return round(sum(benchmark.mean(case, name, FAILURES.metric) for case in benchmark.cases), 9)
-
-    fewest = [name for name in able if losses(name) == min(map(losses, able))]
-    best = min(fewest, key=lambda name: benchmark.mean(crown, name, RMSE.metric))
+    ranks = {name: benchmark.rank(benchmark.cases, name) for name in able}
+    best = min(able, key=lambda name: ranks[name])
+    fewest = [name for name in able if ranks[name][0] == ranks[best][0]]
     lost_of = ", ".join(f"{_plain(FAILURES, benchmark, case, best)} % of {case.name}" for case in benchmark.cases)
     crowns, bodies = _plain(CROWN_95, benchmark, crown, best), _plain(BODY, benchmark, body, best)
     who = f"{', '.join(fewest[:-1])} and {fewest[-1]} lose" if len(fewest) > 1 else f"{best} loses"
-    said = [f"{who} the fewest crystals" + (f", {lost_of}" if len(fewest) == 1 else "")]
-    said += [f"of them {best}, which loses {lost_of}, has the least error in the crown"] if len(fewest) > 1 else []
+    said = [f"{who} the fewest crystals" + (f", {lost_of}" if len(fewest) == 1 else ", as far as the intervals tell")]
+    said += [f"of them {best}, which loses {lost_of}, has the lowest cost"] if len(fewest) > 1 else []
     said += [f"95 % of its crowns are at most {crowns} mm off"] if crowns != NOTHING else []
     said += [f"{bodies} % of the body is within 0.5 mm"] if bodies != NOTHING else []
     return Verdict(f"{'; '.join(said)}.")
