@@ -1,4 +1,4 @@
-"""Verdict and figures: who holds the radius best where, who is shown when there are many."""
+"""Verdict and figures: who ranks first where, who is shown when there are many."""
 
 import io
 from dataclasses import replace
@@ -13,6 +13,7 @@ from PIL import Image
 from cz_gym.baselines import OpenLoop
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
+from cz_gym.evaluation.metrics import Metrics, names_of
 from cz_gym.evaluation.plots import COLUMNS, DPI
 from cz_gym.evaluation.protocol import Case, find_case
 from cz_gym.evaluation.rollout import rollout
@@ -21,7 +22,7 @@ from cz_gym.tools.episodes import ESTIMATES
 from cz_gym.tools.registry import CONTROLLERS
 from cz_gym.tools.report import tables, task_records
 from cz_gym.tools.report.figures import draw_figures
-from cz_gym.tools.report.markdown import brief, finding
+from cz_gym.tools.report.markdown import brief, finding, terminal
 from cz_gym.tools.report.tables import FEWEST, NAMED, best_of_each_kind, chosen, looks_of
 from cz_gym.tools.report.task_records import body_verdict as verdict
 from cz_gym.tools.report.task_records import crystal_verdict
@@ -214,8 +215,9 @@ def test_a_controller_looks_the_same_whoever_takes_part():
 
 
 def test_the_finding_tells_those_who_are_told_apart_and_says_how_much_each_moves():
-    def steps(rmse, moves):
-        return {"rmse_mm": np.linspace(rmse, 1.01 * rmse, 20), "pull_step_rms_mm_per_min": [moves] * 20}
+    def steps(cost, moves):
+        costs = np.linspace(cost, 1.01 * cost, 20)
+        return {"cost": costs, "rmse_mm": [1.0 - cost] * 20, "pull_step_rms_mm_per_min": [moves] * 20}
 
     cases = [replace(find_case(name)) for name in ("randomized", "hard")]
     who = [
@@ -224,13 +226,25 @@ def test_the_finding_tells_those_who_are_told_apart_and_says_how_much_each_moves
         (contender("agent", training_seeds=(0,)), steps(0.2, 0.3)),
     ]  # fmt: skip
     assert finding(made(cases, *who)) == (
-        "Of controllers that are not told which scenario they meet, the agent `agent` holds the radius best: 0.201 and "
-        "0.201 mm on `randomized` and `hard`, against 0.402 and 0.402 mm of the classical controller `free`. Told it, "
-        "`told` has 0.101 and 0.101 mm; on `randomized` the three move the pull speed by 0.3000, 0.2000 and 0.5000 "
-        "mm/min (RMS) from sample to sample."
+        "Of controllers that are not told which scenario they meet, the agent `agent` ranks first by crystals lost, "
+        "then by cost: cost 0.2010 and 0.2010 on `randomized` and `hard`, against 0.4020 and 0.4020 of the classical "
+        "controller `free`. Told it, `told` has 0.1005 and 0.1005; on `randomized` the three are 0.800, 0.600 and "
+        "0.900 mm off (RMSE) and move the pull speed by 0.3000, 0.2000 and 0.5000 mm/min (RMS) a sample."
     )
     assert finding(made(cases, *who[1:])) == ""
-    assert "best, within the intervals: 0.4" in finding(made(cases, *who[:3], (who[3][0], steps(0.399, 0.3))))
+    assert "by cost, within the intervals: cost 0.4" in finding(made(cases, *who[:3], (who[3][0], steps(0.399, 0.3))))
+
+
+@pytest.mark.parametrize("columns", [80, 200])
+def test_tables_and_sentences_fit_the_terminal(columns, monkeypatch):
+    """Columns that do not fit follow below, and every controller has a line in each block."""
+    monkeypatch.setenv("COLUMNS", str(columns))
+    cases, many = [find_case(name) for name in ("randomized", "nominal")], np.linspace(0.1, 0.2, FEWEST)
+    figures = [(who, dict.fromkeys(names_of(Metrics), many) | {"failure_rate": many > 0.19}) for who, _ in everyone()]
+    text = terminal(made(cases, *figures))
+    assert max(map(len, text.splitlines())) <= columns
+    blocks = text.count("\n  lqg-at-0.02-adaptive ")
+    assert blocks == text.count("\n  gradient ") == (4 if columns == 80 else 2)
 
 
 @pytest.mark.filterwarnings("error")

@@ -166,28 +166,28 @@ def finding(benchmark: Benchmark) -> str:
     if graded or tables.too_few(benchmark):
         return ""
 
-    def mean(each: Contender) -> float:
-        return sum(benchmark.mean(case, each.name, tables.RMSE.metric) for case in cases)
+    def rank(each: Contender) -> tuple[float, float]:
+        return benchmark.rank(cases, each.name)
 
     groups: dict[str, list[Contender]] = {"learned": [], "classical": [], "told": []}
     for each in (each for each in benchmark.contenders if not each.bound):
         groups["told" if each.told else "learned" if each.learned else "classical"].append(each)
     if not all(groups.values()):
         return ""
-    best, other, told = (min(group, key=mean) for group in groups.values())
-    best, other = sorted((best, other), key=mean)
-    plain = tables.RMSE._replace(interval=False)
-    errors = [" and ".join(plain.of(benchmark, case, each.name) for case in cases) for each in (best, other, told)]
-    steps = (tables.PULL_STEP._replace(interval=False).of(benchmark, cases[0], n.name) for n in (best, other, told))
-    pairs: Any = ([benchmark.get(case, n.name, tables.RMSE.metric) for n in (best, other)] for case in cases)
+    best, other, told = (min(group, key=rank) for group in groups.values())
+    best, other = sorted((best, other), key=rank)
+    cost, error, step = (each._replace(interval=False) for each in (tables.COST, tables.RMSE, tables.PULL_STEP))
+    costs = [" and ".join(cost.of(benchmark, case, each.name) for case in cases) for each in (best, other, told)]
+    moves = [column.of(benchmark, cases[0], each.name) for column in (error, step) for each in (best, other, told)]
+    pairs: Any = ([benchmark.get(case, n.name, tables.COST.metric) for n in (best, other)] for case in cases)
     clear = all(ours.ends[1] < theirs.ends[0] for ours, theirs in pairs)
     kinds = ["the agent" if each.learned else "the classical controller" for each in (best, other)]
     return (
-        f"Of controllers that are not told which scenario they meet, {kinds[0]} `{best.name}` holds the radius "
-        f"{'best' if clear else 'best, within the intervals'}: {errors[0]} mm on "
-        f"{' and '.join(f'`{case.name}`' for case in cases)}, against {errors[1]} mm of {kinds[1]} `{other.name}`. "
-        f"Told it, `{told.name}` has {errors[2]} mm; on `{cases[0].name}` the three move the pull speed by "
-        "{}, {} and {} mm/min (RMS) from sample to sample.".format(*steps)
+        f"Of controllers that are not told which scenario they meet, {kinds[0]} `{best.name}` ranks first by crystals "
+        f"lost, then by cost{'' if clear else ', within the intervals'}: cost {costs[0]} on "
+        f"{' and '.join(f'`{case.name}`' for case in cases)}, against {costs[1]} of {kinds[1]} `{other.name}`. "
+        f"Told it, `{told.name}` has {costs[2]}; on `{cases[0].name}` the three are "
+        "{}, {} and {} mm off (RMSE) and move the pull speed by {}, {} and {} mm/min (RMS) a sample.".format(*moves)
     )
 
 

@@ -156,13 +156,13 @@ def ring_bias(case: Case, seed: int) -> float:
 # Names come from agent files and are untrusted: they are escaped for HTML and for plotly.
 
 BEST_NOTE = (
-    "The best of each kind by mean RMSE [mm] over these scenarios, and your own. "
-    "Drives and return are those on the first."
+    "Of each kind the one that ranks first over these scenarios (crystals lost, then cost), and your own: RMSE [mm] on "
+    "each. Cost and drives are those on the first."
 )
 ANSWER_NOTE = (
-    "RMSE of the true radius; the difference is learned less classical, and is shown if its 95&nbsp;% interval, on "
-    "the same crystals, leaves out zero. Who moves the pull speed more can have less error: "
-    "docs/controllers/bounds.md compares at equal pull steps."
+    "Mean cost a step, which counts radius error and moves; the difference is learned less classical, and is shown if "
+    "its 95&nbsp;% interval, on the same crystals, leaves out zero. Crystals lost rank before cost, by the lower end "
+    "of their interval."
 )
 _SLOT = re.compile(r"<!-- slot:(\w+) -->")
 
@@ -179,7 +179,7 @@ def page(benchmark: Benchmark, command: str) -> str:
         "verdict": escape(" ".join((verdict.sentence, markdown.finding(benchmark).replace("`", "")))),
         "best": _table(heads, [(f"{name} [{kind}]", *cells) for kind, rows in groups.items() for name, *cells in rows]),
         "best_note": BEST_NOTE,
-        "question": "Who holds the radius best",
+        "question": "Who ranks first where",
         "answer_note": ANSWER_NOTE,
         "limit": f"{config.radius_limit / MM:.3g}",
         "lede": f"{tables.count(len(contenders), 'controller')}, {tables.count(len(benchmark.cases), 'scenario')}, "
@@ -223,10 +223,10 @@ def _html(figure: Figure, name: str) -> str:
 
 
 def _metrics(benchmark: Benchmark, case: Case, is_open: bool) -> str:
-    """Every metric of a scenario, the lowest RMSE first, to unfold."""
+    """Every metric of a scenario, crystals lost and then the lowest cost first, to unfold."""
     error, drives = task_of(case).columns
     columns = (*error, *tables.comparison(benchmark, case), *drives)
-    ranked = sorted(benchmark.contenders, key=lambda each: benchmark.mean(case, each.name, RMSE.metric))
+    ranked = sorted(benchmark.contenders, key=lambda each: benchmark.rank([case], each.name))
     heads = "controller", *(column.heading for column in columns)
     rows = tables.rows(benchmark.only(contenders=ranked), case, columns)
     marks = (" [bound]" * each.bound for each in ranked)

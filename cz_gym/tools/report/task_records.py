@@ -134,12 +134,11 @@ BODY_SHORT = (
     FAILURES._replace(heading="lost [%]", interval=False),
     COST,
     RMSE._replace(interval=False),
-    Column("max_error_mm", "max [mm]", 2, interval=False),
     PULL_STEP._replace(heading="pull step [mm/min]", interval=False),
     HEATER_STEP._replace(heading="heater step [kW]", interval=False),
-    Column("within_half_mm", "in 0.5 mm [%]", 1, PERCENT, interval=False),
+    Column("max_error_mm", "max [mm]", 2, interval=False),
     Column(SPEED, "compute [us/step]", 2),
-    COST._replace(heading=f"cost less {REFERENCE}'s", kind="difference"),
+    COST._replace(heading=f"cost less {REFERENCE}'s", kind="difference", interval=False),
 )
 """Columns on a terminal."""
 
