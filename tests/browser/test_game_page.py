@@ -77,9 +77,10 @@ def test_words_and_curves_stand_out_from_the_ground(game, scheme):
     game.execute_cdp_cmd(
         "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
     )
-    for least, names in ((4.5, ("ink", "faint", "accent")), (3.0, ("ring", "truth", "paper", "lqg", "plan"))):
-        for name in names:
-            assert all(game.execute_script(CONTRAST, name, ground) >= least for ground in ("back", "panel")), name
+    for name in ("ink", "faint", "accent"):
+        assert all(game.execute_script(CONTRAST, name, ground) >= 4.5 for ground in ("back", "panel")), name
+    for name in ("ring", "truth", "paper", "lqg", "plan"):
+        assert game.execute_script(CONTRAST, name, "back") >= 3.0, name
     assert game.execute_script(CONTRAST, "on-accent", "accent") >= 4.5
 
 
