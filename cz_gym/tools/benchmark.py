@@ -29,7 +29,7 @@ from .run import check_agents, check_targets, is_cached, run, write
 CLONE = Path(__file__).resolve().parents[2]
 RESULTS = CLONE / "results" if (CLONE / "results" / "benchmark").is_dir() else Path("runs")
 """Folder of the committed results in a clone, of a user's results elsewhere."""
-README, CRYSTAL_PAGE = CLONE / "README.md", CLONE / "docs" / "crystal.md"
+PAGES = tuple(CLONE / page for page in ("README.md", "docs/benchmark.md", "docs/crystal.md"))
 """Pages of a clone that quote the committed results between two markers."""
 OWN = Path("runs")
 """Folder of results with the user's own controllers, agents or scenarios, each in a folder of their names."""
@@ -115,11 +115,10 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     check_targets(arguments.out, arguments.json, smaller, arguments.overwrite)
     if arguments.out is not None:  # a missing package is named before the work, not after it
         import matplotlib  # noqa: F401
-        import plotly  # noqa: F401
     bounds = BOUNDS if task.has_bound and not arguments.puller else None
     found = run(contenders, cases, arguments.episodes, CACHE, bounds, arguments.quiet, arguments.cluster)
     renewed = not smaller and arguments.out and arguments.out.resolve() == folder_of(arguments)
-    write(arguments.out, arguments.json, found, command, (README, CRYSTAL_PAGE) if renewed else ())
+    write(arguments.out, arguments.json, found, command, PAGES if renewed else ())
     if not arguments.quiet:
         print(terminal(found))
         slow = {each.name for each in task.controllers() if each.slow} - {each.name for each in contenders}

@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 from contextlib import contextmanager
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -17,6 +16,7 @@ from tests.tools.serve.conftest import PASSWORD, running
 selenium = pytest.importorskip("selenium", reason="selenium is absent: pip install '.[browser]'")
 from selenium import webdriver  # noqa: E402
 from selenium.webdriver.chrome.service import Service  # noqa: E402
+from selenium.webdriver.common.keys import Keys  # noqa: E402
 from selenium.webdriver.support.ui import WebDriverWait  # noqa: E402
 
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
@@ -125,10 +125,6 @@ def test_the_operators_page_logs_no_error(screen):
 
 
 EVIL = "</script><img src=x onerror=document.title='evil'>\"'&amp;<b>%{x}<a href=\"javascript:alert(1)\">a</a>"
-PICTURES = ("pareto", "crystal")
-WATCH = """new MutationObserver(() => document.querySelector(".main-svg") && performance.mark("picture"))
-    .observe(document, { subtree: true, childList: true });"""
-"""Script that notes when there are pictures."""
 
 
 @pytest.fixture(scope="module")
@@ -140,16 +136,12 @@ def made():
 
 @pytest.fixture(scope="module")
 def report(made, tmp_path_factory):
-    """Chromium with the page open, its pictures drawn."""
+    """Chromium with the page open."""
     path = tmp_path_factory.mktemp("page") / "report.html"
     path.write_text(page(made, "benchmark.py"), "utf-8")
     with chromium(tmp_path_factory.mktemp("profile")) as driver:
-        driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": WATCH})
         driver.get(Path(path).as_uri())
-        driver.execute_script("document.getElementById('pareto').scrollIntoView()")
-        until(driver, lambda: driver.find_elements("css selector", "#pareto .legendtext"))
-        driver.execute_script("document.getElementById('crystal').scrollIntoView()")
-        until(driver, lambda: driver.find_elements("css selector", "#crystal .legendtext"))
+        until(driver, lambda: driver.find_elements("css selector", "#right-side .panel"))
         yield driver
 
 
@@ -166,43 +158,61 @@ def test_the_page_opens_from_disk_without_an_error_and_fetches_nothing(report):
     assert report.execute_script("return performance.getEntriesByType('resource').length") == 0
 
 
-def test_text_is_painted_before_a_picture_is_drawn(report):
-    script = "return performance.getEntriesByName(arguments[0])[0].startTime"
-    assert report.execute_script(script, "first-contentful-paint") < report.execute_script(script, "picture")
-
-
-def test_the_first_line_is_the_verdict_and_names_are_text(report):
-    assert report.find_element("tag name", "body").text.startswith("No verdict: ")
+def test_the_heading_the_plot_and_the_verdict_come_first_and_names_are_text(report):
+    begins = "return [...document.body.children].slice(0, 3).map(each => each.tagName)"
+    assert report.execute_script(begins) == ["H1", "svg", "P"]
+    assert report.find_element("id", "verdict").text.startswith("No verdict: ")
     assert report.title == "Cz-v0 benchmark"
     assert EVIL in [cell.text for cell in report.find_elements("css selector", "details[open] tbody th")]
     assert report.find_elements("css selector", "img, svg a") == []
-    legend = report.execute_script("return [...document.querySelectorAll('.legendtext')].map(t => t.textContent)")
-    assert any(name.startswith("</script><img src=x") for name in legend)
+    offered = [each.get_attribute("textContent") for each in report.find_elements("css selector", "#left-name option")]
+    assert EVIL in offered
 
 
 @pytest.mark.parametrize("width", [1280, 400])
-def test_no_window_needs_sideways_scrolling_and_nothing_covers_anything(report, width):
+def test_no_window_needs_sideways_scrolling(report, width):
     """Only a table may be wider than the window, inside its own frame."""
     resize(report, width)
     until(report, lambda: report.execute_script("return window.innerWidth") == width)
     until(report, lambda: report.execute_script("return document.documentElement.scrollWidth <= window.innerWidth"))
+    script = "return Math.max(...[...document.querySelectorAll('svg')].map(s => s.getBoundingClientRect().right))"
+    assert report.execute_script(script) <= width
 
-    def box(selector):
-        script = "return document.querySelector(arguments[0]).getBoundingClientRect().toJSON()"
-        return dict(report.execute_script(script, selector))
 
-    until(report, lambda: box("#crystal svg")["right"] <= width)
-    boxes = [box(f"#{picture}") for picture in PICTURES]
-    assert all(lower["top"] >= upper["bottom"] for upper, lower in pairwise(boxes))
-    for picture in PICTURES:
-        assert box(f"#{picture} svg")["right"] <= width
-        assert box(f"#{picture} .nsewdrag")["width"] > 100
-        assert box(f"#{picture} .updatemenu-header")["bottom"] <= box(f"#{picture} .nsewdrag")["top"]
-    assert box("#crystal .updatemenu-header")["bottom"] <= box("#crystal .annotation")["top"]
-    assert box("#crystal .legend")["bottom"] <= boxes[1]["bottom"]
-    labels = report.find_elements("css selector", "#pareto .xtick text")
-    ends = sorted((label.rect["x"], label.rect["x"] + label.rect["width"]) for label in labels)
-    assert all(right <= left for (_, right), (left, _) in pairwise(ends)), "numbers at an axis collide"
+def test_the_player_works_by_keyboard(report):
+    """A key chooses another controller, and an arrow another time; both are shown."""
+    resize(report, 1280)
+    menu, time, clock = (report.find_element("id", name) for name in ("right-name", "time", "clock"))
+    before = report.find_element("id", "right-side").text
+    menu.send_keys("o")
+    until(report, lambda: report.find_element("id", "right-side").text != before)
+    late, place = clock.text, "#left-side .panel .axis"
+    at = report.find_element("css selector", place).get_attribute("d")
+    time.send_keys(Keys.HOME)
+    until(report, lambda: clock.text == "0 min" != late)
+    assert report.find_element("css selector", place).get_attribute("d") != at
+    report.find_element("id", "play").send_keys(Keys.ENTER)
+    until(report, lambda: clock.text not in ("0 min", late))
+    assert report.find_element("id", "play").text == "Pause"
+    report.find_element("id", "play").send_keys(Keys.ENTER)
+
+
+def test_it_is_dark_when_asked_and_prints_whole_tables(report):
+    def grounds(**media):
+        report.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+        script = "return ['body', '.cz .back'].map(n => getComputedStyle(document.querySelector(n)))"
+        return report.execute_script(script + ".map((s, n) => n ? s.fill : s.backgroundColor)")
+
+    light = grounds(features=[{"name": "prefers-color-scheme", "value": "light"}])
+    dark = grounds(features=[{"name": "prefers-color-scheme", "value": "dark"}])
+    assert light == ["rgb(255, 255, 255)"] * 2
+    assert dark == ["rgb(13, 17, 23)"] * 2
+    resize(report, 1040)  # the width of A4 across
+    assert grounds(media="print", features=[]) == light
+    script = "return [...document.querySelectorAll('.scroll')].every(s => s.scrollWidth <= s.clientWidth + 1)"
+    assert report.execute_script(script), "a table is cut"
+    report.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "", "features": []})
+    resize(report, 1280)
 
 
 def test_the_browser_logged_no_error(report):

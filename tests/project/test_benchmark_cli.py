@@ -136,8 +136,7 @@ def test_whole_crystals_are_quoted_in_two_pages(crystals, tmp_path, monkeypatch)
             "a\n<!-- crystal:begin -->\n<!-- crystal:end -->\n<!-- benchmark:begin -->\n<!-- benchmark:end -->"
         )
     monkeypatch.setattr(benchmark, "RESULTS", tmp_path)
-    monkeypatch.setattr(benchmark, "README", pages[0])
-    monkeypatch.setattr(benchmark, "CRYSTAL_PAGE", pages[1])
+    monkeypatch.setattr(benchmark, "PAGES", pages)
     monkeypatch.setattr(benchmark, "is_partial", lambda *_: False)
     small = ["--scenarios", "crown-nominal", "--controllers", "recipe", "--quiet"]
     assert benchmark.main(["--env", "CzCrystal-v0", *small]) == 0
@@ -261,7 +260,7 @@ def test_a_full_run_is_quoted_in_the_readme(tmp_path, monkeypatch):
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "benchmark.json").write_text("old")
     monkeypatch.setattr(benchmark, "folder_of", lambda arguments: tmp_path / "results")
-    monkeypatch.setattr(benchmark, "README", page)
+    monkeypatch.setattr(benchmark, "PAGES", [page])
     assert benchmark.main([*ONE, "--overwrite"]) == 0
     assert "old" in page.read_text()
     monkeypatch.setattr(benchmark, "is_partial", lambda *_: False)
@@ -276,7 +275,7 @@ def test_a_full_run_is_quoted_in_the_readme(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("no_work")
-@pytest.mark.parametrize("package", ["matplotlib", "plotly", "tqdm", "onnxruntime"])
+@pytest.mark.parametrize("package", ["matplotlib", "tqdm", "onnxruntime"])
 def test_a_missing_extra_is_named(package, tmp_path, monkeypatch, refusal):
     agent = constant_agent(tmp_path / "agent.onnx")
     monkeypatch.setitem(sys.modules, package, None)

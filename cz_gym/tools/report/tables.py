@@ -36,7 +36,7 @@ class Column(NamedTuple):
 
     def text(self, estimate: Estimate | None) -> str:
         """Return the mean in the column's unit, with its interval if it has one that is shown."""
-        if estimate and not self.interval:
+        if estimate and not (self.interval and estimate.ends[0] == estimate.ends[0]):  # NaN: of too few crystals
             estimate = estimate._replace(ci95=None)
         known = estimate and estimate.mean == estimate.mean  # NaN: the metric does not apply
         return estimate.text(f"z.{self.decimals}f", self.unit) if estimate and known else NOTHING

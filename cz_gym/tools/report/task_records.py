@@ -9,8 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from cz_gym.body.signals import PULL_TOLERANCE, TOLERANCE
 from cz_gym.crystal.recipe import FAILURE_MODES
 from cz_gym.evaluation.metrics import (
@@ -65,8 +63,7 @@ class Panel(NamedTuple):
     scale: float
     """Size of the unit in SI units."""
     lines: Mapping[str, Callable[[Any, float], Floats]]
-    """Lines by name, each a function of an episode's signals and the operator's bias [m], in SI units. "true" and
-    "camera" (its reading) are drawn for each controller; other lines are the same for all and drawn once."""
+    """Lines by name, each a function of an episode's signals and the operator's bias [m], in SI units."""
     levels: tuple[float, ...] = ()
     """Values that are marked [unit]."""
 
@@ -77,22 +74,9 @@ PANELS = (
         {"camera": lambda s, bias: s.r_br_measured - bias - s.r_ref, "true": lambda s, bias: s.r_c - s.r_ref},
         (-TOLERANCE / MM, 0.0, TOLERANCE / MM),
     ),
-    Panel(
-        "bright ring less radius", "mm", MM,
-        {
-            "camera": lambda s, bias: s.r_br_measured - bias - s.r_c,
-            "true": lambda s, bias: s.r_br - bias - s.r_c,
-            "hidden offset": lambda s, bias: s.ring_offset,
-        },
-        (0.0,),
-    ),
     Panel("pull speed", "mm/min", MM_PER_MIN, {"true": lambda s, bias: s.v_p}),
-    Panel("growth rate", "mm/min", MM_PER_MIN, {"true": lambda s, bias: s.v_g}),
     Panel("heater power", "kW", KILO, {"true": lambda s, bias: s.Q_H}),
-    Panel("heater temperature", "K", 1.0, {"true": lambda s, bias: s.T_1, "recipe": lambda s, bias: s.T_1_ref}),
-    Panel("melt temperature", "K", 1.0, {"true": lambda s, bias: s.T_b}),
     Panel("meniscus height", "mm", MM, {"true": lambda s, bias: s.h_c}),
-    Panel("growth angle", "deg", np.pi / 180.0, {"true": lambda s, bias: s.alpha_c}, (0.0,)),
 )  # fmt: skip
 _RECIPES: dict[str, Callable[[Any, float], Floats]] = {
     "pull speed": lambda s, bias: s.v_p_ref,
@@ -101,12 +85,11 @@ _RECIPES: dict[str, Callable[[Any, float], Floats]] = {
 }
 CRYSTAL_PANELS = (
     PANELS[0]._replace(lines={"true": PANELS[0].lines["true"]}),
-    PANELS[1]._replace(levels=()),
     *(each._replace(lines={**each.lines, "recipe": line} if (line := _RECIPES.get(each.title)) else each.lines)
-      for each in PANELS[2:]),
+      for each in PANELS[1:]),
     Panel("v/G by the recipe's", "1", 1.0, {"true": lambda s, bias: s.v_over_G}, (1.0,)),
 )  # fmt: skip
-"""Panels of a whole crystal, against its length; the ring is not where the recipe's ring is while the radius is off."""
+"""Panels of a whole crystal; the ring is not where the recipe's ring is while the radius is off."""
 
 # Cz-v0: three hours of the body.
 

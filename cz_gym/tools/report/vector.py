@@ -30,7 +30,8 @@ STYLE = "\n".join(
         ".cz text{fill:#1b1f24}.cz .faint{fill:#5a626c}.cz .back{fill:#fff}"
         ".cz .grid{stroke:#e1e5ea;fill:none}.cz .axis{stroke:#5a626c;fill:none}",
         "".join(f".c{number}{{color:{colour}}}" for number, colour in enumerate(COLOURS)),
-        "@media (prefers-color-scheme:dark){.cz text{fill:#e6e9ee}.cz .faint{fill:#a4adb9}.cz .back{fill:#0d1117}"
+        "@media screen and (prefers-color-scheme:dark){"
+        ".cz text{fill:#e6e9ee}.cz .faint{fill:#a4adb9}.cz .back{fill:#0d1117}"
         ".cz .grid{stroke:#2a323d}.cz .axis{stroke:#a4adb9}"
         + "".join(f".c{number}{{color:{lighter(colour)}}}" for number, colour in enumerate(COLOURS))
         + "}",
@@ -248,7 +249,7 @@ def _point(benchmark: Benchmark, case: Case, each: Contender, look: Style | None
         (low, high), (slow, fast) = error.ends, moves.ends
         parts = [bar(x, up.at(low), x, up.at(high), look), bar(across.at(slow), y, across.at(fast), y, look)]
     elif error.mean > up.high:
-        parts = [text(x, y - 12.0, f"↑ {error.mean:.3g}", "middle", font_size="13")]
+        parts = [text(x + 11.0, y + 5.0, f"↑ {error.mean:.3g}", font_size="13")]
     else:
         words = f"{moves.mean:.3g} →" if moves.mean > across.high else "← 0"
         at_end = moves.mean > across.high
