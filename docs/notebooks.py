@@ -6,8 +6,15 @@ import sys
 from pathlib import Path
 
 import jupytext
+import nbformat
 
 DOCS = Path(__file__).parent
+INSTALL = """import subprocess, sys
+
+if "google.colab" in sys.modules:  # elsewhere the package is installed already
+    source = "cz-gym[agents,benchmark,render] @ git+https://github.com/cz-gym/cz-gym"
+    subprocess.run([sys.executable, "-m", "pip", "install", "-q", source], check=True)"""
+"""First cell of each notebook."""
 PAGES = ("first-agent", "extend/controller", "inverse-response", "camera")
 
 
@@ -19,6 +26,7 @@ def write(folder: Path) -> list[Path]:
         there = os.path.relpath((DOCS / page).parent, folder)
         text = (DOCS / f"{page}.md").read_text().replace("```bash", "```text")
         notebook = jupytext.reads(re.sub(r"\]\((?!\w+:|#)", f"]({there}/", text), fmt="md")
+        notebook.cells.insert(0, nbformat.v4.new_code_cell(INSTALL))
         notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
         jupytext.write(notebook, file)
     return written
