@@ -92,8 +92,8 @@ def ring_bias(case: Case, seed: int) -> float:
 
 
 BEST_NOTE = (
-    "The paper's controller, of each kind the one that ranks first over these scenarios (crystals lost, then cost), and "
-    "your own: RMSE [mm] on each. Cost and drives are those on the first."
+    "The paper's controller, of each kind the one that ranks first over these scenarios (crystals lost, then cost), "
+    "and your own: RMSE [mm] on each. Cost and drives are those on the first."
 )
 ANSWER_NOTE = (
     "Mean cost a step, which counts radius error and moves; the difference is learned less classical, and is shown if "
