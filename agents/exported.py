@@ -6,6 +6,7 @@ operations of one step, so that what is left are operations on rows (n, width). 
 result like every agent's graph; it alone reads files that others wrote.
 """
 
+from operator import add, floordiv, mul, sub
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,9 @@ ALIASES = ("Identity", "Cast", "Dropout", "Unsqueeze", "Squeeze", "Flatten", "Re
 """Operators that leave the numbers of a row as they are, where they leave its length."""
 GATES = {"RNN": 1, "GRU": 3, "LSTM": 4}
 """Recurrent operators, and how many vectors of the state's length their weights give."""
+
+ARITHMETIC: dict[str, Any] = {"Mul": mul, "Add": add, "Sub": sub, "Div": floordiv}
+"""Operators that may compute a length."""
 
 
 def to_plain(source: bytes | Path, channels: int) -> bytes:
@@ -51,7 +55,7 @@ class _Rebuilt:
     """The nodes of a model on rows of pullers, in the order of the model."""
 
     def __init__(self, model: Any, channels: int) -> None:
-        from onnx import helper, numpy_helper, shape_inference
+        from onnx import helper, numpy_helper
 
         self.opset = next((each.version for each in model.opset_import if each.domain in ("", "ai.onnx")), OPSET)
         self.constants: dict[str, Any] = {each.name: numpy_helper.to_array(each) for each in model.graph.initializer}
@@ -60,18 +64,9 @@ class _Rebuilt:
             _free_rows(value)
         self.dims: dict[str, list[Any]] = {}
         """Values of shape arithmetic; "n" where one is the number of pullers."""
-        while True:
-            del model.graph.value_info[:]
-            for value in model.graph.output:
-                value.type.tensor_type.ClearField("shape")
-            known = shape_inference.infer_shapes(model, data_prop=True).graph
-            self.shapes = {
-                value.name: [dim.dim_value or "n" for dim in value.type.tensor_type.shape.dim]
-                for value in (*known.input, *known.value_info, *known.output)
-                if value.type.tensor_type.HasField("shape")
-            }
-            if not self._fold(model.graph):  # computed lengths make more shapes known
-                break
+        self.shapes = _shapes_of(model)
+        while self._fold(model.graph):  # computed lengths make more shapes known
+            self.shapes = _shapes_of(model)
         self.rows: dict[str, str] = {}
         """Name in the new graph of each value with rows."""
         self.nodes: list[Any] = []
@@ -173,26 +168,15 @@ class _Rebuilt:
 
     def _fold(self, graph: Any) -> bool:
         """Compute the nodes of constants and known lengths, and remove them; True if there was one."""
-        from onnx import helper, numpy_helper
+        from onnx import numpy_helper
 
-        known, left = set(self.constants), []
-        for node in graph.node:
-            attributes = {each.name: helper.get_attribute_value(each) for each in node.attribute}
-            given = [name for name in node.input if name]
-            if node.op_type == "Shape" and given[0] in self.shapes and given[0] not in self.constants:
-                dims = self.shapes[given[0]]
-                self.dims[node.output[0]] = dims[attributes.get("start", 0) : attributes.get("end", len(dims))]
-                self._settle(node.output[0])
-            elif all(name in self.constants for name in given):
-                self._compute(node)
-            elif all(name in self.constants or name in self.dims for name in given):
-                self._count(node, attributes)
-            else:
-                lengths = self.dims.get(node.input[1], ()) if node.op_type == "Reshape" else ()
-                if list(lengths).count("n") == 1:
-                    self.constants[name := f"{node.input[1]} open"] = np.array([-1 if k == "n" else k for k in lengths])
-                    node.input[1] = name
-                left.append(node)
+        known = set(self.constants)
+        left = [node for node in graph.node if not self._known(node)]
+        for node in left:
+            lengths = self.dims.get(node.input[1], ()) if node.op_type == "Reshape" else ()
+            if list(lengths).count("n") == 1:
+                self.constants[name := f"{node.input[1]} open"] = np.array([-1 if k == "n" else k for k in lengths])
+                node.input[1] = name
         folded = len(left) < len(graph.node)
         del graph.node[:]
         graph.node.extend(left)
@@ -201,11 +185,29 @@ class _Rebuilt:
         )
         return folded
 
+    def _known(self, node: Any) -> bool:
+        """Compute a node of constants and known lengths; False for one that depends on more."""
+        from onnx import helper
+
+        attributes = {each.name: helper.get_attribute_value(each) for each in node.attribute}
+        given = [name for name in node.input if name]
+        if node.op_type == "Shape" and given[0] in self.shapes and given[0] not in self.constants:
+            dims = self.shapes[given[0]]
+            self.dims[node.output[0]] = dims[attributes.get("start", 0) : attributes.get("end", len(dims))]
+            self._settle(node.output[0])
+        elif all(name in self.constants for name in given):
+            self._compute(node)
+        elif all(name in self.constants or name in self.dims for name in given):
+            self._count(node)
+        else:
+            return False
+        return True
+
     def _settle(self, name: str) -> None:
         if "n" not in self.dims[name]:
             self.constants[name] = np.array(self.dims.pop(name), np.int64)
 
-    def _count(self, node: Any, attributes: dict[str, Any]) -> None:
+    def _count(self, node: Any) -> None:
         """Shape arithmetic: what picks and joins known lengths."""
         parts = [
             self.dims[name] if name in self.dims else np.atleast_1d(self.constants[name]).tolist()
@@ -214,26 +216,12 @@ class _Rebuilt:
         ]
         if node.op_type == "Gather":
             found = [parts[0][int(i)] for i in parts[1]]
-            scalar = np.ndim(self.constants[node.input[1]]) == 0
-            self.dims[node.output[0]] = found
-            if scalar and found[0] != "n":
-                self.dims.pop(node.output[0])
+            if np.ndim(self.constants[node.input[1]]) == 0 and found[0] != "n":
                 self.constants[node.output[0]] = np.int64(found[0])
                 return
-        elif node.op_type == "Concat":
-            self.dims[node.output[0]] = [dim for part in parts for dim in part]
-        elif node.op_type in ("Mul", "Add", "Sub", "Div") and all(len(part) == 1 for part in parts):
-            (a,), (b,) = parts
-            known = {"Mul": lambda: a * b, "Add": lambda: a + b, "Sub": lambda: a - b, "Div": lambda: a // b}
-            if "n" in (a, b) and not (node.op_type == "Mul" and 1 in (a, b)):
-                raise GraphError("computes with the number of pullers")
-            self.dims[node.output[0]] = ["n" if "n" in (a, b) else known[node.op_type]()]
-        elif node.op_type in ("Unsqueeze", "Squeeze", "Cast", "Identity", "Reshape"):
-            self.dims[node.output[0]] = parts[0]
-        elif node.op_type == "Slice":
-            self.dims[node.output[0]] = parts[0][int(parts[1][0]) : int(parts[2][0])]
         else:
-            raise GraphError(f"computes with the number of pullers, in {node.op_type}")
+            found = _lengths(node.op_type, parts)
+        self.dims[node.output[0]] = found
         self._settle(node.output[0])
 
     def _compute(self, node: Any) -> None:
@@ -288,16 +276,7 @@ class _Rebuilt:
         operator, first, result = node.op_type, node.input[0], node.output[0]
         values: list[Any] = [self.constants.get(name) for name in node.input[1:]]
         if operator == "Slice":
-            axes: Any = values[2] if len(values) > 2 and values[2] is not None else range(len(values[0]))
-            rows = self.rows[first]
-            for place, axis in enumerate(np.asarray(axes).tolist()):
-                low, high = (int(each[place]) for each in values[:2])
-                step = int(values[3][place]) if len(values) > 3 and values[3] is not None else 1
-                if self._axis(first, axis) == "width":
-                    rows = self._emit("Slice", [rows, *(np.array([each]) for each in (low, high, 1, step))])
-                elif (low, step) != (0, 1) or high < (1 if self._axis(first, axis) == "one" else 2**31 - 1):
-                    raise GraphError("cuts another axis than that of the channels")
-            self.rows[result] = rows
+            self.rows[result] = self._slice(first, *values)
             return
         axis = attributes.get("axis", 0)
         kind = self._axis(result if operator == "Concat" else first, axis)
@@ -313,6 +292,18 @@ class _Rebuilt:
             ends = np.cumsum([0, *(self._length(name) for name in node.output)]).tolist()
             for name, low, high in zip(node.output, ends, ends[1:], strict=False):
                 self.rows[name] = self._columns(self.rows[first], low, high)
+
+    def _slice(self, name: str, lows: Any, highs: Any, axes: Any = None, steps: Any = None) -> str:
+        """Cut columns from a value's rows, along any axes; GraphError where pullers would be left out."""
+        rows = self.rows[name]
+        for place, axis in enumerate(np.asarray(range(len(lows)) if axes is None else axes).tolist()):
+            low, high, step = int(lows[place]), int(highs[place]), 1 if steps is None else int(steps[place])
+            kind = self._axis(name, axis)
+            if kind == "width":
+                rows = self._emit("Slice", [rows, *(np.array([each]) for each in (low, high, 1, step))])
+            elif (low, step) != (0, 1) or high < (1 if kind == "one" else 2**31 - 1):
+                raise GraphError("cuts another axis than that of the channels")
+        return rows
 
     def _step(self, node: Any, attributes: dict[str, Any]) -> None:
         """One step of a recurrent layer in plain operations; ONNX's gates are in the orders z r h, and i o f c."""
@@ -331,25 +322,11 @@ class _Rebuilt:
         x, h = self.rows[named["X"]], self.rows[named["h"]]
         inside = self._emit("Gemm", [x, W, B[: len(W)]], transB=1)
         before = self._emit("Gemm", [h, R, B[len(W) :]], transB=1)
-
-        def gate(place: int, rows: str) -> str:
-            return self._columns(rows, place * size, (place + 1) * size)
-
         if kind == "GRU":
-            z, r = (self._emit("Sigmoid", [self._emit("Add", [gate(i, inside), gate(i, before)])]) for i in range(2))
-            recalled = self._emit("Mul", [r, gate(2, before)])
-            if not attributes.get("linear_before_reset", 0):
-                reset = self._emit("Mul", [r, h])
-                recalled = self._emit("Gemm", [reset, R[2 * size :], B[len(W) + 2 * size :]], transB=1)
-            new = self._emit("Tanh", [self._emit("Add", [gate(2, inside), recalled])])
-            kept = self._emit("Mul", [z, self._emit("Sub", [h, new])])
-            after = [self._emit("Add", [new, kept])]
+            again = (R[2 * size :], B[len(W) + 2 * size :]) if not attributes.get("linear_before_reset", 0) else None
+            after = [self._gru(size, inside, before, h, again)]
         elif kind == "LSTM":
-            total = self._emit("Add", [inside, before])
-            i, o, f = (self._emit("Sigmoid", [gate(place, total)]) for place in range(3))
-            new = self._emit("Mul", [i, self._emit("Tanh", [gate(3, total)])])
-            cell = self._emit("Add", [self._emit("Mul", [f, self.rows[named["c"]]]), new])
-            after = [self._emit("Mul", [o, self._emit("Tanh", [cell])]), cell]
+            after = self._lstm(size, self._emit("Add", [inside, before]), self.rows[named["c"]])
         else:
             after = [self._emit("Tanh", [self._emit("Add", [inside, before])])]
         for name, rows in zip(node.output, [after[0], *after], strict=False):
@@ -357,26 +334,86 @@ class _Rebuilt:
                 self._length(name)
                 self.rows[name] = rows
 
+    def _gru(self, size: int, inside: str, before: str, h: str, again: Any) -> str:
+        """New state of a GRU; ``again`` has weights and bias that act on the reset state, None: on the state."""
+        gates = [[self._columns(rows, k * size, (k + 1) * size) for rows in (inside, before)] for k in range(3)]
+        z, r = (self._emit("Sigmoid", [self._emit("Add", [*gates[k]])]) for k in range(2))
+        if again:
+            recalled = self._emit("Gemm", [self._emit("Mul", [r, h]), *again], transB=1)
+        else:
+            recalled = self._emit("Mul", [r, gates[2][1]])
+        new = self._emit("Tanh", [self._emit("Add", [gates[2][0], recalled])])
+        return self._emit("Add", [new, self._emit("Mul", [z, self._emit("Sub", [h, new])])])
+
+    def _lstm(self, size: int, total: str, c: str) -> list[str]:
+        """New state and cell of an LSTM."""
+        *gates, candidate = (self._columns(total, k * size, (k + 1) * size) for k in range(4))
+        i, o, f = (self._emit("Sigmoid", [rows]) for rows in gates)
+        cell = self._emit("Add", [self._emit("Mul", [f, c]), self._emit("Mul", [i, self._emit("Tanh", [candidate])])])
+        return [self._emit("Mul", [o, self._emit("Tanh", [cell])]), cell]
+
+
+def _shapes_of(model: Any) -> dict[str, list[Any]]:
+    """Infer the shapes of a model's values, by name; "n" is the number of pullers."""
+    from onnx import shape_inference
+
+    del model.graph.value_info[:]
+    for value in model.graph.output:
+        value.type.tensor_type.ClearField("shape")
+    known = shape_inference.infer_shapes(model, data_prop=True).graph
+    return {
+        value.name: [dim.dim_value or "n" for dim in value.type.tensor_type.shape.dim]
+        for value in (*known.input, *known.value_info, *known.output)
+        if value.type.tensor_type.HasField("shape")
+    }
+
+
+def _lengths(operator: str, parts: list[list[Any]]) -> list[Any]:
+    """Compute an operator on lengths, each a list; GraphError where the number of pullers would decide."""
+    if operator == "Concat":
+        return [dim for part in parts for dim in part]
+    if operator in ("Unsqueeze", "Squeeze", "Cast", "Identity", "Reshape"):
+        return parts[0]
+    if operator == "Slice":
+        return parts[0][int(parts[1][0]) : int(parts[2][0])]
+    if operator not in ARITHMETIC or any(len(part) != 1 for part in parts):
+        raise GraphError(f"computes with the number of pullers, in {operator}")
+    (a,), (b,) = parts
+    if "n" not in (a, b):
+        return [ARITHMETIC[operator](a, b)]
+    if operator != "Mul" or 1 not in (a, b):
+        raise GraphError("computes with the number of pullers")
+    return ["n"]
+
+
+def _some_inputs(graph: Any) -> dict[str, Any]:
+    """Draw values for the inputs of a graph, by name; three pullers where their number is open."""
+    random, weights = np.random.default_rng(0), {each.name for each in graph.initializer}
+    inputs = [value for value in graph.input if value.name not in weights]
+    shapes = [[dim.dim_value or 3 for dim in value.type.tensor_type.shape.dim] for value in inputs]
+    wide = [value.type.tensor_type.elem_type == 11 for value in inputs]
+    return {
+        value.name: random.normal(size=shape).astype(np.float64 if big else np.float32)
+        for value, shape, big in zip(inputs, shapes, wide, strict=True)
+    }
+
+
+def _joined(parts: list[Any]) -> list[Any]:
+    """Return the first part, and the others as columns of one array if there are any."""
+    return [parts[0], *([np.concatenate(parts[1:], axis=1)] if parts[1:] else [])]
+
 
 def _compare(before: Any, after: Any) -> None:
     """GraphError unless both models give the same actions and states for some observations."""
     from onnx.reference import ReferenceEvaluator
 
-    random, weights = np.random.default_rng(0), {each.name for each in before.graph.initializer}
-    inputs = [value for value in before.graph.input if value.name not in weights]
-    shapes = [[dim.dim_value or 3 for dim in value.type.tensor_type.shape.dim] for value in inputs]
-    wide = [value.type.tensor_type.elem_type == 11 for value in inputs]
-    rows = [
-        random.normal(size=shape).astype(np.float64 if big else np.float32)
-        for shape, big in zip(shapes, wide, strict=True)
-    ]
-    wanted = ReferenceEvaluator(before).run(None, dict(zip((value.name for value in inputs), rows, strict=True)))
+    inputs = _some_inputs(before.graph)
+    rows = [*inputs.values()]
+    wanted = ReferenceEvaluator(before).run(None, inputs)
     n = rows[0].size // after.graph.input[0].type.tensor_type.shape.dim[1].dim_value
     flat = [each.reshape(n, -1).astype(np.float32) for each in rows]
-    given = dict(zip(INPUTS, [flat[0], *([np.concatenate(flat[1:], axis=1)] if flat[1:] else [])], strict=False))
-    found = ReferenceEvaluator(after).run(None, given)
-    parts = [np.reshape(each, (n, -1)) for each in wanted]
-    for one, other in zip([parts[0], *([np.concatenate(parts[1:], axis=1)] if parts[1:] else [])], found, strict=True):
+    found = ReferenceEvaluator(after).run(None, dict(zip(INPUTS, _joined(flat), strict=False)))
+    for one, other in zip(_joined([np.reshape(each, (n, -1)) for each in wanted]), found, strict=True):
         if one.shape != other.shape or not np.allclose(one, other, rtol=1e-3, atol=1e-4):
             raise GraphError("would act otherwise once it is rebuilt: give a simpler network")
 

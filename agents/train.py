@@ -192,8 +192,11 @@ class TrainingRun:
         with locked(self.folder):
             if summary := self.summary:
                 return summary
+            bar = tqdm(disable=True) if bar is None else bar
+            bar.set_description("compiling")
             self.begin()
-            self.learn(tqdm(disable=True) if bar is None else bar)
+            self.learn(bar)
+            bar.set_description("testing the best agent")
             return self.finish()
 
     def begin(self) -> None:
@@ -243,6 +246,7 @@ class TrainingRun:
     def validate(self, bar: Any) -> None:
         """Export the actor as it stands and run the file itself on validation episodes; keep it if it is the best."""
         path, config = self.folder / "agent.onnx", self.recipe.config
+        bar.set_description("validating")
         normalisation = self.algorithm.get_vec_normalize_env()
         agent = to_agent(self.algorithm, self.recipe.name, self.seed, config, normalisation, path)
         figures = recipes.validate(agent, config, recipes.SELECTION_SEEDS)
@@ -263,11 +267,13 @@ class TrainingRun:
         self.save()
         for name, figure in figures._asdict().items():
             self.logger.record(f"validation/{name}", figure)
-        others = ", ".join(f"{name} {rmse:.3f}" for name, rmse in picked.items())
-        figures_now = f"RMSE {figures.rmse_mm:.3f} mm, {figures.failure_rate:.0%} lost ({others})"
+        figures_now = f"{figures.rmse_mm:.3f} mm, {figures.failure_rate:.0%} lost"
+        bar.set_description("learning", refresh=False)
         bar.set_postfix_str(figures_now)
         if not sys.stderr.isatty() and parent_process() is None:  # a log holds lines
-            print(f"{self.steps:,} steps: {figures_now}", flush=True)
+            left = (self.recipe.steps / self.steps - 1.0) * (time.monotonic() - self.began)
+            others = ", ".join(f"{name} {rmse:.3f}" for name, rmse in picked.items())
+            print(f"{self.steps:,} steps: {figures_now} ({others}); {tqdm.format_interval(left)} left", flush=True)
 
     def finish(self) -> dict[str, float]:
         """Test the best agent on episodes that did not choose it; returns the content of ``summary.json``."""
@@ -340,6 +346,8 @@ class _Watch(BaseCallback):
 
     def _on_step(self) -> bool:
         run, interrupted = self.run, self.interrupted()
+        if not self.bar.n:
+            self.bar.set_description("learning", refresh=False)
         self.bar.update(run.steps - self.bar.n)
         if run.steps >= self.due:
             run.validate(self.bar)

@@ -81,7 +81,7 @@ def train(arguments: argparse.Namespace) -> int:
         import matplotlib  # noqa: F401  # if it is missing, say so before the training
     from tqdm import tqdm
 
-    from cz_gym.agents.recipes import references
+    from cz_gym.agents.recipes import REFERENCES, references
     from cz_gym.agents.train import TrainingRun, load_callback, train_seeds
 
     folders = [arguments.out.resolve() / f"seed{seed}" for seed in arguments.seeds or ()] or [arguments.out]
@@ -100,7 +100,10 @@ def train(arguments: argparse.Namespace) -> int:
         print(f"{recipe.steps:,} steps are {recipe.updates} updates of {recipe.name}: too few to learn from")
     where = f"{recipe.environment} ({', '.join(recipe.stages)}), " if recipe.environment else ""
     print(f"{recipe.name}, {amount} on {where}{recipe.config.scenario.name}{machine}, into {arguments.out}", flush=True)
-    options = references(make_controller, recipe), arguments.checkpoint_seconds, arguments.plot, callbacks
+    print(f"measuring {', '.join(REFERENCES[recipe.config.process.name])} on the validation crystals", flush=True)
+    beside = references(make_controller, recipe)
+    print(", ".join(f"{name} {rmse:.3f}" for name, (rmse, _) in beside.items()), "mm; making the learner", flush=True)
+    options = beside, arguments.checkpoint_seconds, arguments.plot, callbacks
     runs = [TrainingRun(folder, recipe, seed, *options) for folder, seed in zip(folders, seeds, strict=True)]
     if not arguments.seeds:
         with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, disable=None) as bar:

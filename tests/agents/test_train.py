@@ -254,7 +254,9 @@ def test_ctrl_c_before_anything_was_kept_advises_no_resume(tmp_path, monkeypatch
     assert train.main(["--steps", "12000", "--out", str(tmp_path / "run")]) == 130
     told = capsys.readouterr()
     assert told.err == "cz-gym train: interrupted; nothing was kept yet\n"
-    assert told.out.splitlines()[-1].startswith("ppo, seed 0, 12,000 steps on "), "the first word before the references"
+    first, last = told.out.splitlines()[-2:]
+    assert first.startswith("ppo, seed 0, 12,000 steps on "), "the first word before the references"
+    assert last == "measuring paper, paper-tuned, lqg on the validation crystals"
 
 
 # Training seeds in parallel come out as one by one, and nothing is lost or done twice.

@@ -219,20 +219,24 @@ def _hours_left_out(times: Any) -> Any:
     return (step > HOUR) & (step <= HOUR + most) & sunday & at_end
 
 
+def _fit_unit(text: Any, unit: str) -> tuple[str, bool, float] | None:
+    """Return a unit in which texts are times of a log, if their step is a log's, and their span [s]; None: none."""
+    far = text.iloc[np.unique(np.linspace(0, len(text) - 1, 500).astype(int))]
+    times, near = _read_times(far, unit)[0], _read_times(text.iloc[:500], unit)[0]
+    backwards = (times.diff() < -1.1 * HOUR).sum() > (len(text) if unit == "clock" else 0)
+    step = near.diff().abs().median()
+    if times.notna().mean() > 0.95 and not backwards and (step <= INTERVALS[1]):
+        return unit, bool(INTERVALS[0] <= step), times.max() - times.min()
+    return None
+
+
 def _units_meant(text: Any, name: str) -> str:
     """Hint at the units in which rows all over the column are times that grow as a log's; empty if there is none."""
     if len(text) < 2:
         return ""
-    far = text.iloc[np.unique(np.linspace(0, len(text) - 1, 500).astype(int))]
-    meant = []
-    for unit in TIME:
-        times, near = _read_times(far, unit)[0], _read_times(text.iloc[:500], unit)[0]
-        backwards = (times.diff() < -1.1 * HOUR).sum() > (len(text) if unit == "clock" else 0)
-        step = near.diff().abs().median()
-        if times.notna().mean() > 0.95 and not backwards and (step <= INTERVALS[1]):
-            meant.append((INTERVALS[0] <= step, unit, times.max() - times.min()))
-    units = [unit for good, unit, _ in meant if good or not any(each for each, *_ in meant)]
-    spans = {unit: span for _, unit, span in meant if unit in ("dmy", "mdy")}
+    fitting = list(filter(None, (_fit_unit(text, unit) for unit in TIME)))
+    best = [each for each in fitting if each[1]] or fitting
+    units, spans = [unit for unit, *_ in best], {unit: span for unit, _, span in fitting if unit in ("dmy", "mdy")}
     units = [unit for unit in units if spans.get(unit, 0.0) <= 3.0 * min(spans.values(), default=0.0)]
     if {"dmy", "mdy"} <= set(units) and "." in text.iloc[0][:6]:
         units.remove("mdy")  # nobody writes the month first between dots

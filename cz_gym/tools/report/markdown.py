@@ -156,6 +156,18 @@ def brief(benchmark: Benchmark) -> str:
     return summary(benchmark.only(cases, tables.chosen(benchmark, cases[0], task_of(cases[0]).quoted_rows)))
 
 
+def _firsts(benchmark: Benchmark, cases: Sequence[Case]) -> list[Contender]:
+    """Who ranks first of agents and of classical controllers that are not told the scenario, in order, and of the told.
+
+    Fewer than three where such controllers did not take part; bounds left out.
+    """
+    able = sorted(benchmark.contenders, key=lambda each: benchmark.rank(cases, each.name))
+    groups: dict[str, Contender] = {}
+    for each in (each for each in able if not each.bound):
+        groups.setdefault("told" if each.told else "learned" if each.learned else "classical", each)
+    return sorted(groups.values(), key=lambda each: each.told)
+
+
 def finding(benchmark: Benchmark) -> str:
     """Say what was found in two sentences: the best of those not told the scenario, of each kind, and of those told.
 
@@ -165,22 +177,15 @@ def finding(benchmark: Benchmark) -> str:
     graded = cases[0].tolerance is not None or task_of(cases[0]).by_length
     if graded or tables.too_few(benchmark):
         return ""
-
-    def rank(each: Contender) -> tuple[float, float]:
-        return benchmark.rank(cases, each.name)
-
-    groups: dict[str, list[Contender]] = {"learned": [], "classical": [], "told": []}
-    for each in (each for each in benchmark.contenders if not each.bound):
-        groups["told" if each.told else "learned" if each.learned else "classical"].append(each)
-    if not all(groups.values()):
+    firsts = _firsts(benchmark, cases)
+    if len(firsts) < 3:
         return ""
-    best, other, told = (min(group, key=rank) for group in groups.values())
-    best, other = sorted((best, other), key=rank)
+    best, other, told = firsts
     cost, error, step = (each._replace(interval=False) for each in (tables.COST, tables.RMSE, tables.PULL_STEP))
-    costs = [" and ".join(cost.of(benchmark, case, each.name) for case in cases) for each in (best, other, told)]
-    moves = [column.of(benchmark, cases[0], each.name) for column in (error, step) for each in (best, other, told)]
-    pairs: Any = ([benchmark.get(case, n.name, tables.COST.metric) for n in (best, other)] for case in cases)
-    clear = all(ours.ends[1] < theirs.ends[0] for ours, theirs in pairs)
+    costs = [" and ".join(cost.of(benchmark, case, each.name) for case in cases) for each in firsts]
+    moves = [column.of(benchmark, cases[0], each.name) for column in (error, step) for each in firsts]
+    get: Any = benchmark.get
+    clear = all(get(case, best.name, "cost").ends[1] < get(case, other.name, "cost").ends[0] for case in cases)
     kinds = ["the agent" if each.learned else "the classical controller" for each in (best, other)]
     return (
         f"Of controllers that are not told which scenario they meet, {kinds[0]} `{best.name}` ranks first by crystals "
