@@ -359,7 +359,7 @@ class Step(NamedTuple):
     offset: Floats
     """Offset of the bright ring that no sensor shows [m], shape (n,)."""
     grows: npt.NDArray[np.bool_]
-    """Whether the crystal grew, shape (n,). One that is lost or whose episode is over stays as it is; its cost and its
+    """True if the crystal grew, shape (n,). One that is lost or whose episode is over stays as it is; its cost and its
     derivatives are 0."""
     jacobian: Floats
     """Derivatives of the next state and of the cost's terms, shape (n, 14, 12): rows are state and cost, columns the
@@ -408,7 +408,7 @@ class DifferentiableBatch:
         self._costs = [info.index(f"term_{name}") for name in config.process.Cost._fields]
         self._errors = [info.index(name) for name in (*config.process.BriefInfo._fields[:2], "ring_offset")]
         self.grows, self._begun = np.ones(num_envs, np.bool_), np.zeros(num_envs, np.bool_)
-        """Whether each crystal grew in the last step, and whether each slot has one, shape (n,)."""
+        """True for each crystal that grew in the last step, and for each slot that has one, shape (n,)."""
         self._work = np.zeros(work_shape(config.process))
         self._jacobian = self.num_envs, len(rows(config.process)), len(self._names) + ACTIONS
         shows = len(config.process.measured), len(self._names)
@@ -494,7 +494,7 @@ class DifferentiableBatch:
 
     @property
     def lost(self) -> npt.NDArray[np.bool_]:
-        """Whether each crystal is lost, shape (n,): one that has reached its length does not grow on either."""
+        """True if each crystal is lost, shape (n,): one that has reached its length does not grow on either."""
         lost: npt.NDArray[np.bool_] = ~self.grows & (self._batch.memory.slots["over"] == LOST)
         return lost
 

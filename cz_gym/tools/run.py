@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -30,7 +30,7 @@ from cz_gym.support.errors import CzError, software
 from cz_gym.support.files import check_writable, name_file_in_errors, write_files
 
 from .episodes import CODE, CONTRACT, GAPS, KEYS, Benchmark, read_episodes, read_estimates, to_csv, values_of
-from .report.task_records import TASKS, contract_hash, task_of
+from .report.task_records import TASKS, TaskRecord, contract_hash, task_of
 
 PRINTED = 1e-4
 """Relative precision of the figures in the bounds' table, five digits [-]."""
@@ -327,14 +327,6 @@ def read_benchmark(path: Path) -> Benchmark:
     task = next((each for each in TASKS.values() if {*results} <= {case.name for case in each.cases}), None)
     if task is None:
         raise CzError(f"{path}: scenarios of the user's own, which are not in the file")
-    known = {each.name: each for each in task.controllers()}
-    contracts = iter(facts["agents"])
-    contenders = []
-    for name, each in facts["controllers"].items():
-        seeds = tuple(each["training_seeds"])
-        trained = tuple(SimpleNamespace(contract=SimpleNamespace(**next(contracts))) for _ in seeds)
-        own = Contender(**{**each, "training_seeds": seeds, "trained": trained, "make": _not_here})
-        contenders.append(known.get(name, own))
     everyone = [found for of in results.values() for found in of.values()]
     metrics = [name for name in names_of(task.metrics) if all(found[name]["mean"] is not None for found in everyone)]
     met = [
@@ -344,7 +336,17 @@ def read_benchmark(path: Path) -> Benchmark:
     episodes = pd.DataFrame(met, columns=[*KEYS])
     frame, _ = read_estimates(path, metrics)
     cases = tuple(find_case(name, task.cases) for name in results)
-    return Benchmark(cases, tuple(contenders), episodes, frame, {}, episodes.iloc[:0])
+    return Benchmark(cases, tuple(_who_took_part(facts, task)), episodes, frame, {}, episodes.iloc[:0])
+
+
+def _who_took_part(provenance: Mapping[str, Any], task: TaskRecord) -> Iterator[Contender]:
+    """The contenders of a file of results: named controllers, and others that know what they are and cannot run."""
+    known, contracts = {each.name: each for each in task.controllers()}, iter(provenance["agents"])
+    for each in provenance["controllers"].values():
+        seeds = tuple(each["training_seeds"])
+        trained = tuple(SimpleNamespace(contract=SimpleNamespace(**next(contracts))) for _ in seeds)
+        made = Contender(**{**each, "training_seeds": seeds, "trained": trained, "make": _not_here})
+        yield known.get(made.name, made)
 
 
 def _not_here(config: Any) -> Any:

@@ -13,6 +13,7 @@ from cz_gym.agents.recipes import CRYSTAL_ENV, CRYSTAL_RECIPES, DEFAULT_RECIPE, 
 from cz_gym.agents.train import read_settings
 from cz_gym.config import check_config
 from cz_gym.crystal.process import ENVIRONMENTS
+from cz_gym.episodes.scenarios import ALL
 from cz_gym.puller.file import chosen_puller
 from cz_gym.support.command_line import OneLineParser, between, interpreter, run_command
 from cz_gym.support.errors import CzError, unknown_name_message
@@ -99,7 +100,8 @@ def train(arguments: argparse.Namespace) -> int:
     if recipe.updates < FEW_UPDATES:
         print(f"{recipe.steps:,} steps are {recipe.updates} updates of {recipe.name}: too few to learn from")
     where = f"{recipe.environment} ({', '.join(recipe.stages)}), " if recipe.environment else ""
-    print(f"{recipe.name}, {amount} on {where}{recipe.config.scenario.name}{machine}, into {arguments.out}", flush=True)
+    crystals = "all" if recipe.config.scenario == ALL else recipe.config.scenario.name
+    print(f"{recipe.name}, {amount} on {where}{crystals}{machine}, into {arguments.out}", flush=True)
     print(f"measuring {', '.join(REFERENCES[recipe.config.process.name])} on the validation crystals", flush=True)
     beside = references(make_controller, recipe)
     print(", ".join(f"{name} {rmse:.3f}" for name, (rmse, _) in beside.items()), "mm; making the learner", flush=True)
@@ -123,7 +125,7 @@ def _summary_line(summary: dict[str, float]) -> str:
     errors = {name.removesuffix(ends): value for name, value in summary.items() if name.endswith(ends)}
     return (
         f"best agent on {summary['validation_episodes']} validation episodes: mean RMSE "
-        f"{errors.pop('validation'):.3f} mm, {100 * summary['failure_rate']:.1f} % lost; beside it "
+        f"{errors.pop('validation'):.3f} mm, {100 * summary['failure_rate']:.1f} % lost\n  beside it "
         + ", ".join(f"{name} {value:.3f}" for name, value in errors.items())
     )
 

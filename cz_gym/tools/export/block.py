@@ -318,21 +318,21 @@ class Call(NamedTuple):
     """The samples that a call takes, from its time; shape (n,) each."""
 
     due: Any
-    """Whether a sample is taken in this pass."""
+    """True if a sample is taken in this pass."""
     again: Any
-    """Whether another sample follows in this call."""
+    """True if another sample follows in this call."""
     later: Any
-    """Whether a sample went before in this call."""
+    """True if a sample went before in this call."""
     share: Any
     """1 over the number of samples that are left with this one."""
     samples: Any
     """Number of samples of the call."""
     starts: Any
-    """Whether this is the first call, or the first after a gap."""
+    """True if this is the first call, or the first after a gap."""
     late: Any
-    """Whether the call came late."""
+    """True if the call came late."""
     sound: Any
-    """Whether the time moves forward."""
+    """True if the time moves forward."""
     clock: Any
     """Time up to which samples will have been taken [s]."""
 
@@ -358,11 +358,11 @@ class Ring(NamedTuple):
     """The checked ring of a sample; shape (n,) each."""
 
     good: Any
-    """Whether the ring is good."""
+    """True if the ring is good."""
     error: Any
     """Its distance from the reference, without its steps [m]."""
     stepped: Any
-    """Whether it has jumped by more than a crystal can."""
+    """True if it has jumped by more than a crystal can."""
     last: Any
     """:attr:`Memory.last_ring` [m]."""
     still_time: Any
@@ -416,9 +416,9 @@ class Readings(NamedTuple):
     """The pyrometer's reading above nominal; infinite if it is bad [K]."""
     ring: Ring
     pyrometer: Any
-    """Whether the pyrometer is good."""
+    """True if the pyrometer is good."""
     reference: Any
-    """Whether references and previews are good."""
+    """True if references and previews are good."""
     last_T_1: Any
     """:attr:`Memory.last_T_1`."""
     frozen_time: Any
@@ -455,7 +455,7 @@ def sample_of(
 
 
 def settings_are_sane(given: Any) -> Any:
-    """Whether the settings are numbers in the right order."""
+    """True if the settings are numbers in the right order."""
     ordered = given["pull_speed_min_mm_per_min"] <= given["pull_speed_max_mm_per_min"]
     ordered = ordered & (given["heater_power_min_kW"] <= given["heater_power_max_kW"])
     positive = ("pull_slew_mm_per_min2", "heater_slew_kW_per_min", "nominal_pull_speed_mm_per_min", "gap_s",
@@ -468,7 +468,7 @@ class Drive(NamedTuple):
     """One drive at a sample, in the unit of its port."""
 
     known: Any
-    """Whether its reading is good."""
+    """True if its reading is good."""
     applied: Any
     """The reading; without a good one the last setpoint."""
     held: Any
@@ -488,11 +488,11 @@ class Drive(NamedTuple):
     error: Any
     """The part of it that counts as an error of the reading."""
     errs: Any
-    """Whether that is large enough to tell."""
+    """True if that is large enough to tell."""
 
     @property
     def away(self) -> Any:
-        """Whether the drive is far from its last setpoint."""
+        """True if the drive is far from its last setpoint."""
         return self.known & (np.abs(self.applied - self.error - self.sent) > self.far)
 
     def told(self, follows: Any, corrects: Any) -> Any:
@@ -548,5 +548,5 @@ def drive_of(
 
 
 def finite(value: Any) -> Any:
-    """Whether a number is neither NaN nor infinite, which recorded programs have as large ones."""
+    """True if a number is neither NaN nor infinite, which recorded programs have as large ones."""
     return np.abs(value) <= FINITE

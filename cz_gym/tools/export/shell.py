@@ -81,7 +81,7 @@ class Controller(Protocol):
 
     @property
     def accepts_missing_temperature(self) -> bool:
-        """Whether the controller estimates the temperature, and so gets an infinite reading of a bad pyrometer."""
+        """True if the controller estimates the temperature, and so gets an infinite reading of a bad pyrometer."""
 
     @property
     def observes(self) -> bool:

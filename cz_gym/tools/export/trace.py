@@ -54,7 +54,7 @@ class Node:
     data: Any = None
     """Values of a constant, name of an input, (m, k, n) of a matrix product."""
     wide: bool = False
-    """Whether it is in double precision also where the controller computes in single precision."""
+    """True if it is in double precision also where the controller computes in single precision."""
 
 
 @dataclass
@@ -152,7 +152,7 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
 
     @property
     def logical(self) -> bool:
-        """Whether the elements are logical."""
+        """True if the elements are logical."""
         return bool(self.size) and self.graph.owner(int(self.ids.flat[0])).logical
 
     def __len__(self) -> int:
@@ -403,7 +403,7 @@ class Cell(NamedTuple):
     after: Ids
     """Elements that the array holds after a sample."""
     wide: bool = False
-    """Whether the array needs double precision."""
+    """True if the array needs double precision."""
 
 
 @dataclass(frozen=True)
@@ -417,9 +417,9 @@ class Program:
     outputs: tuple[tuple[Port, Ids], ...]
     memory: tuple[Cell, ...]
     due: Ids
-    """Whether the memory changes at this call, one logical element."""
+    """True if the memory changes at this call, one logical element."""
     again: Ids
-    """Whether another sample of the same call follows, one logical element."""
+    """True if another sample of the same call follows, one logical element."""
     notes: tuple[str, ...] = ()
     """Facts for the header of each written file: puller, hashes, scenario."""
 
