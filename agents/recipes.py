@@ -98,7 +98,7 @@ class APG(TrainingConfig):
     """Analytic policy gradients: follows the gradient of the cost through policy, memory and plant."""
 
     name: str = "gradient"
-    steps: int = 24_192_000
+    steps: int = 96_768_000
     num_envs: int = 192
     learning_rate: float = 4e-3
     observation: str = "measured"
