@@ -90,12 +90,9 @@ def between(least: int, most: int) -> Callable[[str], int]:
             value = Decimal(text)
         except InvalidOperation:
             value = Decimal("nan")
-        if not value.is_finite():
-            raise argparse.ArgumentTypeError(f"must be a whole number such as 1000 or 1e3, not {text}")
-        if not least <= value <= most:
-            raise argparse.ArgumentTypeError(f"must be between {least} and {most}, not {text}")
-        if value != (whole := int(value)):
-            raise argparse.ArgumentTypeError(f"must be a whole number, not {text}")
+        whole = int(value) if value.is_finite() and least <= value <= most else None
+        if whole is None or whole != value:
+            raise argparse.ArgumentTypeError(f"must be a whole number between {least} and {most}, not {text}")
         return whole
 
     return number

@@ -115,7 +115,6 @@ def content(path):
 def test_a_run_leaves_everything_and_goes_on(algorithm, tmp_path, capsys):
     folder = tmp_path / "run"
     assert train.main(["--algo", algorithm, "--steps", "9000", "--seed", "3", "--out", str(folder), "--plot"]) == 0
-    crystals = "0.175 hard + 0.175 hot-zone + 0.175 puller + 0.3 randomized + 0.175 sensor-fault"
     assert f" steps on all, into {folder}\n" in capsys.readouterr().out
     assert (folder / "progress.png").read_bytes().startswith(b"\x89PNG")
     saved = content(folder / "settings.json")
