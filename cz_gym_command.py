@@ -31,8 +31,9 @@ COMMANDS = {
 }
 """For each word its module, whose ``main`` takes the arguments after it, and what it does."""
 EXTRAS = {
-    **dict.fromkeys(("matplotlib", "plotly", "tqdm", "pandas", "control", "onnx", "onnxruntime"), "benchmark"),
+    **dict.fromkeys(("matplotlib", "tqdm", "pandas", "control", "onnx", "onnxruntime"), "benchmark"),
     **dict.fromkeys(("stable_baselines3", "torch", "filelock"), "agents"),
+    "plotly": "plant",
 }
 """Extras of packages that commands import at their beginning."""
 SOON = 0.5
