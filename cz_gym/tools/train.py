@@ -82,7 +82,6 @@ def train(arguments: argparse.Namespace) -> int:
         import matplotlib  # noqa: F401  # if it is missing, say so before the training
     from tqdm import tqdm
 
-    from cz_gym.agents.recipes import REFERENCES, references
     from cz_gym.agents.train import TrainingRun, load_callback, train_seeds
 
     folders = [arguments.out.resolve() / f"seed{seed}" for seed in arguments.seeds or ()] or [arguments.out]
@@ -100,12 +99,9 @@ def train(arguments: argparse.Namespace) -> int:
     if recipe.updates < FEW_UPDATES:
         print(f"{recipe.steps:,} steps are {recipe.updates} updates of {recipe.name}: too few to learn from")
     where = f"{recipe.environment} ({', '.join(recipe.stages)}), " if recipe.environment else ""
-    crystals = "all" if recipe.config.scenario == ALL else recipe.config.scenario.name
+    crystals = {ALL.name: "all"}.get(recipe.config.scenario.name, recipe.config.scenario.name)
     print(f"{recipe.name}, {amount} on {where}{crystals}{machine}, into {arguments.out}", flush=True)
-    print(f"measuring {', '.join(REFERENCES[recipe.config.process.name])} on the validation crystals", flush=True)
-    beside = references(make_controller, recipe)
-    print(", ".join(f"{name} {rmse:.3f}" for name, (rmse, _) in beside.items()), "mm; making the learner", flush=True)
-    options = beside, arguments.checkpoint_seconds, arguments.plot, callbacks
+    options = _measure_references(recipe), arguments.checkpoint_seconds, arguments.plot, callbacks
     runs = [TrainingRun(folder, recipe, seed, *options) for folder, seed in zip(folders, seeds, strict=True)]
     if not arguments.seeds:
         with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, disable=None) as bar:
@@ -118,6 +114,16 @@ def train(arguments: argparse.Namespace) -> int:
             bar.write(f"seed {run.seed}: {_summary_line(summary)}")
     print(f"wrote agent.onnx into {len(runs)} folders of {arguments.out}")
     return 0
+
+
+def _measure_references(recipe: TrainingConfig) -> Any:
+    """Measure the classical controllers that the agent is shown beside, and say so before and after."""
+    from cz_gym.agents.recipes import REFERENCES, references
+
+    print(f"measuring {', '.join(REFERENCES[recipe.config.process.name])} on the validation crystals", flush=True)
+    found = references(make_controller, recipe)
+    print(", ".join(f"{name} {rmse:.3f}" for name, (rmse, _) in found.items()), "mm; making the learner", flush=True)
+    return found
 
 
 def _summary_line(summary: dict[str, float]) -> str:
