@@ -143,7 +143,7 @@ def faults() -> Lines:
     """Radius error and lost crystals of each block under each fault."""
     cells: dict[str, list[str]] = {}
     controllers = dict[str, None]()
-    for controller, fault, error, _, lost, _ in rows_of("faults/report.md")[1:]:
+    for controller, fault, error, _, lost, *_ in rows_of("faults/report.md")[1:]:
         controllers[controller] = None
         cells.setdefault(fault, []).extend((error, lost))
     head = [each for name in controllers for each in (f"{code(name)} [mm]", "lost")]
@@ -174,7 +174,7 @@ TABLES: dict[str, Callable[[], Lines]] = {
     "gaps": gaps,
     "ratios": equal,
     "frontier": frontier,
-    "whole": partial(figures, "whole", ("compensated", "lqg-along", "ppo-along", "gradient-along"), ("whole",), WHOLE),
+    "whole": partial(figures, "whole", ("compensated", "lqg-along", "gradient-along"), ("whole",), WHOLE),
     "stock": partial(copied, "stock/table.md"),
     "offline": partial(copied, "offline/lqg-mixed.txt", "offline/operator-paper.txt"),
     "on-pullers": on_pullers,
