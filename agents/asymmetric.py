@@ -8,7 +8,7 @@ observations of the environment as it is. Needs stable-baselines3.
 
 from collections.abc import Sequence
 from functools import cache
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,9 +26,11 @@ from cz_gym.process import Channel
 from cz_gym.spaces import observations
 from cz_gym.support.errors import CzError, require_type
 
+from .residual import ADDED
+
 GAINS = {
     "ring_error": 8.0, "integral": 4.0, "v_p": 8.0, "Q_H": 8.0, "r_c_error": 8.0, "h_c": 8.0, "T_b": 8.0, "dT_i": 2.0,
-    "ring_offset": 8.0, "lam": 4.0, "v_p_mean": 2.0,
+    "ring_offset": 8.0, "lam": 4.0, "v_p_mean": 2.0, "asked_v_p": 8.0, "asked_Q_H": 8.0,
 }  # fmt: skip
 """Factors that bring channels that vary little while a crystal is held to the order of 1; the others need none."""
 
@@ -37,6 +39,7 @@ class Layout(NamedTuple):
     """The channels that an asymmetric policy is given."""
 
     history: tuple[Channel, ...]
+    """Those of "history", after those of :data:`cz_gym.agents.residual.ADDED` if the agent adds to a controller."""
     state: tuple[Channel, ...]
     present: int
     """Number of channels of "history" that show the present; the last one is the integral of the ring error."""
@@ -47,11 +50,11 @@ class Layout(NamedTuple):
 @cache
 def layout(width: int) -> Layout:
     """Find the environment whose "history" and true state have that many channels; CzError if none has."""
-    for process in ENVIRONMENTS.values():
-        history, state = observations(process)["history"], process.state
+    for process, added in product(ENVIRONMENTS.values(), ((), ADDED)):
+        history, state = (*added, *observations(process)["history"]), process.state
         if width == len(history) + len(state):
             unknown = [i for i, each in enumerate(state) if each not in process.measured]
-            return Layout(history, state, len(process.measured) + 1, unknown)
+            return Layout(history, state, len(added) + len(process.measured) + 1, unknown)
     raise CzError("this policy is told the true state: make_vec_env(..., critic_state=True)")
 
 

@@ -23,6 +23,7 @@ from cz_gym.support.files import write_files
 
 from .exported import to_plain
 from .graph import GraphError, check_graph
+from .residual import ALONE, Base, Residual
 
 FORMAT = "cz-gym-agent"
 FORMAT_VERSION = 6
@@ -80,14 +81,27 @@ class Contract:
     """Name and hash of the puller file that it was trained for (:attr:`cz_gym.puller.file.PullerFile.label`)."""
     environment: str = "Cz-v0"
     """Name of the environment that it was trained in."""
+    controller: str = ALONE
+    """Name and hash of the controller that its actions are added to."""
+    pull_limit: float = 0.0
+    """Largest addition to that controller's pull speed, as a share of v_0 [-]."""
+    heater_limit: float = 0.0
+    """Largest addition to that controller's heater power [kW]."""
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Every field of the file; an agent that acts alone has none about a controller."""
+        return {k: v for k, v in asdict(self).items() if self.controller != ALONE or k not in OF_CONTROLLER}
 
     @property
     def hash(self) -> str:
         """SHA-256 of the network and of every other field: what the file does, and what it declares (64 hex digits)."""
-        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(json.dumps(self.facts, sort_keys=True).encode()).hexdigest()
 
 
-ADDED_FIELDS = {"puller": DEFAULT.label, "environment": "Cz-v0"}
+OF_CONTROLLER: dict[str, Any] = {"controller": ALONE, "pull_limit": 0.0, "heater_limit": 0.0}
+"""Fields about the controller that an agent adds to, of one that acts alone."""
+ADDED_FIELDS = {"puller": DEFAULT.label, "environment": "Cz-v0", **OF_CONTROLLER}
 """Fields that older files do not have, with the values that hold for those."""
 
 
@@ -128,7 +142,7 @@ def make_contract(onnx_bytes: bytes, **facts: Any) -> Contract:
 
 def agent_files(path: Path, onnx_bytes: bytes, contract: Contract) -> dict[Path, bytes]:
     """Contents of the files ``path`` (.onnx) and its contract (.json)."""
-    content = {"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(contract), "hash": contract.hash}
+    content = {"format": FORMAT, "format_version": FORMAT_VERSION, **contract.facts, "hash": contract.hash}
     text = json.dumps(content, indent=2) + "\n"
     return {path: onnx_bytes, path.with_suffix(".json"): text.encode()}
 
@@ -245,21 +259,25 @@ class OnnxPolicy:
     """Length of the agent's state; 0 if it has none."""
     content: bytes = field(default=b"", repr=False, compare=False)
     """The ONNX file, so that a policy pickles."""
+    residual: Residual | None = None
+    """The controller that the agent adds to, and the limits; None if it acts alone."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self).of, (self.contract, self.content)
+        return type(self).of, (self.contract, self.content, None, "agent", self.residual and self.residual.base)
 
     @classmethod
-    def load(cls, path: str | Path, config: Config | None = None) -> Self:
+    def load(cls, path: str | Path, config: Config | None = None, base: Base | None = None) -> Self:
         """Load an agent file (.onnx, with its .json beside it); nothing in it is executed but its tensor operations.
 
-        With a config, it must have been trained on the same nominal plant. AgentFileError says why it is refused.
+        With a config, it must have been trained on the same nominal plant. An agent that adds to a controller needs
+        this one as its ``base`` (:func:`cz_gym.tools.registry.load_agent` gives it). AgentFileError says why it is
+        refused.
         """
         path = Path(path)
         if path.suffix != ".onnx":
             said = f"{path}: not an .onnx agent file; cz_gym.agents.load({str(path)!r}) loads a shipped agent"
             raise AgentFileError(said)
-        policy = cls.of(*read_agent(path), config, path)
+        policy = cls.of(*read_agent(path), config, path, base)
         written = read_json(path.with_suffix(".json")).get("hash", policy.contract.hash)
         if written != policy.contract.hash:
             raise AgentFileError(f"{path.with_suffix('.json')}: changed after it was written (its hash differs)")
@@ -267,8 +285,9 @@ class OnnxPolicy:
 
     @classmethod
     def of(
-        cls, contract: Contract, onnx_bytes: bytes, config: Config | None = None, path: str | Path = "agent"
-    ) -> Self:
+        cls, contract: Contract, onnx_bytes: bytes, config: Config | None = None, path: str | Path = "agent",
+        base: Base | None = None,
+    ) -> Self:  # fmt: skip
         """Make an agent of its contract and ONNX file; ``path`` names it in errors."""
         environment, known = contract.environment, dict[str, Any]()
         if environment in ENVIRONMENTS:
@@ -294,7 +313,9 @@ class OnnxPolicy:
             ):
                 if own != other:
                     raise AgentFileError(f"{path}: trained for {what} {own}, this environment's is {other}")
-        policy = cls(contract, *_session(path, onnx_bytes, expected), onnx_bytes)
+        residual = _residual(path, contract, base)
+        width = expected + (residual.width if residual else 0)
+        policy = cls(contract, *_session(path, onnx_bytes, width), onnx_bytes, residual)
         try:
             policy.predict(np.zeros((2, expected), np.float32))
         except AgentFileError as error:
@@ -338,6 +359,11 @@ class OnnxPolicy:
                 f'gym.make("{self.contract.environment}", **agent.settings) gives them'
             )
         rows = np.atleast_2d(array)
+        if self.residual:
+            added, state = self.residual.read(rows, state, episode_start)
+            (wanted,) = self._run({"observation": np.concatenate([added, rows], axis=1)})
+            action, state = self.residual.act(wanted, state)
+            return tag(action[0] if array.ndim == 1 else action, self.made_for), state
         if not self.memory_length:
             (action,) = self._run({"observation": rows})
             return (action[0] if array.ndim == 1 else action), state
@@ -359,6 +385,20 @@ class OnnxPolicy:
             raise AgentFileError(f"agent {self.contract.sha256[:12]}: its action is not two finite numbers")
         outputs[0] = tag(outputs[0], self.made_for)
         return outputs
+
+
+def _residual(path: str | Path, contract: Contract, base: Base | None) -> Residual | None:
+    """The controller that the agent adds to; AgentFileError unless it is the one it was trained on."""
+    if contract.controller == ALONE:
+        return None
+    if base is None:
+        raise AgentFileError(
+            f"{path}: adds to the controller {contract.controller}: cz-gym benchmark --agent runs both, "
+            "cz_gym.tools.registry.load_agent loads both"
+        )
+    if base.label != contract.controller:
+        raise AgentFileError(f"{path}: trained on the controller {contract.controller}, not on {base.label}")
+    return Residual(base, contract.pull_limit, contract.heater_limit)
 
 
 def _session(path: str | Path, onnx_bytes: bytes, channels: int) -> tuple[Any, int]:

@@ -17,13 +17,13 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_wrapper
 from torch import nn
 
 from cz_gym.config import Config, check_config, make_config
 from cz_gym.env import CzEnv, CzVectorEnv
 from cz_gym.evaluation.protocol import PLANT, REWARD, STATE, VALIDATION_SEEDS, scenarios
-from cz_gym.sb3 import CzVecEnv, environment_steps
+from cz_gym.sb3 import AddToController, CzVecEnv, environment_steps
 from cz_gym.spaces import observations
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import require_type
@@ -34,6 +34,7 @@ from .asymmetric import Asymmetric
 from .contract import AgentFileError, Contract, OnnxPolicy, agent_files, facts_of, make_contract
 from .from_torch import export
 from .recipes import JUDGING_SEEDS, validate
+from .residual import Residual
 
 ALGORITHMS = {
     "apg": "cz_gym.agents.apg:APG",
@@ -244,11 +245,15 @@ def to_agent(
     algorithm: BaseAlgorithm, name: str, seed: int, config: Config, normalisation: VecNormalize | None, path: str | Path
 ) -> OnnxPolicy:
     """Make an agent called ``name`` of the algorithm's policy, not validated yet; ``path`` names it in errors."""
-    policy = algorithm.policy
-    content = to_onnx(policy, len(observations(config.process)[config.observation]), normalisation)
+    policy, env = algorithm.policy, algorithm.get_env()
+    loop = None if env is None else unwrap_vec_wrapper(env, AddToController)
+    residual: Residual | None = loop and loop.residual
+    width = len(observations(config.process)[config.observation]) + (residual.width if residual else 0)
+    content = to_onnx(policy, width, normalisation)
     contract = make_contract(
         content,
         **facts_of(config),
+        **(residual.facts if residual else {}),
         algorithm=name,
         learned_from=PLANT if isinstance(algorithm, APG) else STATE if isinstance(policy, Asymmetric) else REWARD,
         training_seed=seed,
@@ -256,7 +261,7 @@ def to_agent(
         validation_cost=0.0,
         validation_rmse_mm=0.0,
     )
-    return OnnxPolicy.of(contract, content, config, path)
+    return OnnxPolicy.of(contract, content, config, path, residual.base if residual else None)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -26,11 +26,13 @@ from cz_gym.env import CzVectorEnv
 from cz_gym.evaluation.metrics import Metrics, metrics
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS, scenarios
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.sb3 import ActionRepeat, CzVecEnv
+from cz_gym.sb3 import ActionRepeat, AddToController, CzVecEnv
+from cz_gym.support.errors import require_type
 
 from . import apg
 from .asymmetric import AsymmetricPolicy, AsymmetricSACPolicy
 from .contract import Contract
+from .residual import Base, Residual
 
 LEAST_ENVS, LEAST_BATCH = 8, 64
 """Least number of crystals at a time, and of samples in a batch, on a small budget."""
@@ -172,6 +174,18 @@ class PPO(Reinforcement):
 
 
 @dataclass(frozen=True, kw_only=True)
+class PPOResidual(PPO):
+    """PPO of additions to a given controller, within limits (:mod:`cz_gym.agents.residual`)."""
+
+    name: str = "pid-with-learning"
+    action: str = "direct"
+    controller: str = "pid-conventional"
+    """Name of the controller, or FILE.py:NAME."""
+    limits: tuple[float, float] = (0.1, 1.0)
+    """Largest additions: to the pull speed, as a share of v_0 [-], and to the heater power [kW]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SAC(Reinforcement):
     """Soft actor-critic; its actor has PPO's estimate, its critics read products of state and action
     (:class:`cz_gym.agents.asymmetric.StateCritic`)."""
@@ -205,7 +219,7 @@ class SAC(Reinforcement):
 
 PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64))
 """stable-baselines3's own PPO, told nothing: beside ``ppo`` it shows what the true state is worth in training."""
-RECIPES: dict[str, TrainingConfig] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG())}
+RECIPES: dict[str, TrainingConfig] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG(), PPOResidual())}
 """Recipes by name: the choices of ``cz-gym train --algo``."""
 _along: dict[str, Any] = {
     "environment": CRYSTAL_ENV,
@@ -221,8 +235,11 @@ DEFAULT_RECIPE = "ppo"
 """Recipe of ``cz-gym train`` unless another is named."""
 
 
-def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0) -> BaseAlgorithm:
-    """Make the algorithm of a recipe for a training seed; a resumed one has taken ``done`` steps before."""
+def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base | None = None) -> BaseAlgorithm:
+    """Make the algorithm of a recipe for a training seed; a resumed one has taken ``done`` steps before.
+
+    ``base`` is the controller of a :class:`PPOResidual`.
+    """
     torch.set_num_threads(1)  # small networks are quicker so
     torch.manual_seed(seed)
     learns = isinstance(recipe, Reinforcement)
@@ -248,6 +265,8 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0) -> BaseAlgo
     known = {name for each in kind.__mro__ for name in inspect.signature(each.__init__).parameters}
     settings = {name: getattr(recipe, name) for name in asdict(recipe) if name in known}
     if isinstance(recipe, Reinforcement):
+        if isinstance(recipe, PPOResidual):
+            env = AddToController(env, Residual(require_type(Base, base, "it is added to"), *recipe.limits))
         env = ActionRepeat(env, recipe.action_repeat)
         env = VecNormalize(env, norm_obs=False, gamma=recipe.gamma)
         settings["learning_rate"] = partial(linear_schedule, recipe.learning_rate)

@@ -43,6 +43,7 @@ from .asymmetric import Asymmetric, LearnState
 from .contract import MAX_JSON_BYTES, AgentFileError, OnnxPolicy, agent_files, read_bounded, read_json
 from .from_sb3 import to_agent
 from .recipes import TrainingConfig, make_algorithm, repeat_of
+from .residual import Base
 
 CHECKPOINT = "checkpoint.zip"
 """Name of the checkpoint in a run's folder."""
@@ -151,6 +152,8 @@ class TrainingRun:
     """Whether to draw the progress into the folder."""
     callbacks: tuple[str, ...] = ()
     """Places FILE.py:NAME of the user's callbacks."""
+    base: Base | None = None
+    """Controller that the agent adds to; None if it acts alone."""
     files: dict[str, bytes] = field(default_factory=dict, init=False, repr=False)
     """The run's other files as the next checkpoint holds them."""
     rows: list[dict[str, Any]] = field(default_factory=list, init=False, repr=False)
@@ -208,11 +211,11 @@ class TrainingRun:
             write_files({self.folder / name: content for name, content in self.files.items()})
             self.rows = read_rows(self.folder / "progress.csv")
             self.began -= checkpoint.seconds
-            self.algorithm = make_algorithm(self.recipe, self.seed, checkpoint.steps)
+            self.algorithm = make_algorithm(self.recipe, self.seed, checkpoint.steps, self.base)
             restore(self.algorithm, checkpoint, self.folder / CHECKPOINT)
             self.saved, self.saved_steps = time.monotonic(), self.steps
         else:
-            self.algorithm = make_algorithm(self.recipe, self.seed)
+            self.algorithm = make_algorithm(self.recipe, self.seed, 0, self.base)
             self.save()
         # Made last: a run that is refused leaves no folder.
         self.logger = configure_logger(0, str(self.folder / "tensorboard"), "run", reset_num_timesteps=False)
@@ -277,7 +280,7 @@ class TrainingRun:
 
     def finish(self) -> dict[str, float]:
         """Test the best agent on episodes that did not choose it; returns the content of ``summary.json``."""
-        agent = OnnxPolicy.load(self.folder / "agent.onnx", self.recipe.config)
+        agent = OnnxPolicy.load(self.folder / "agent.onnx", self.recipe.config, self.base)
         figures = recipes.validate(agent, self.recipe.config, recipes.JUDGING_SEEDS)
         summary = {
             "validation_episodes": len(recipes.JUDGING_SEEDS),

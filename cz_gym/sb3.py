@@ -233,6 +233,38 @@ class ActionRepeat(VecEnvWrapper):
         return observation, earned, done, infos
 
 
+class AddToController(VecEnvWrapper):
+    """Actions are added to those of a controller, which runs in the batch (:class:`cz_gym.agents.residual.Residual`).
+
+    Its channels stand before those of the observation. It acts at every step: repeat actions around this wrapper.
+    """
+
+    def __init__(self, venv: VecEnv, residual: Any) -> None:
+        self.residual, self.memory = residual, None
+        width: Any = residual.width + np.array(venv.observation_space.shape)
+        super().__init__(venv, Box(-np.inf, np.inf, width, np.float32))
+
+    def reset(self) -> Any:
+        """Reset every slot."""
+        return self._shown(self.venv.reset(), np.ones(self.num_envs, np.bool_))
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the sum of both for :meth:`step_wait`."""
+        action, self.memory = self.residual.act(actions, self.memory)
+        self.venv.step_async(action)
+
+    def step_wait(self) -> Any:
+        """Advance every slot; a last observation has the controller's channels of the step before."""
+        observation, reward, done, infos = self.venv.step_wait()
+        for i in np.flatnonzero(done).tolist():
+            infos[i]["terminal_observation"] = np.concatenate([self.added[i], infos[i]["terminal_observation"]])
+        return self._shown(observation, done), reward, done, infos
+
+    def _shown(self, observation: np.ndarray, begins: np.ndarray) -> np.ndarray:
+        self.added, self.memory = self.residual.read(observation, self.memory, begins)
+        return np.concatenate([self.added, observation], axis=1)
+
+
 def environment_steps(model: BaseAlgorithm) -> int:
     """Training steps of a model [environment steps]; each repeat of an action counts."""
     env = model.get_env()

@@ -23,6 +23,7 @@ from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.units import MM
 from cz_gym.tools.report.markdown import terminal
 
+from .registry import load_agent
 from .report.task_records import TASKS
 from .run import check_agents, check_targets, is_cached, run, write
 
@@ -158,10 +159,10 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
     """
     usual = cases[0].design_config() if cases else None
     own, given = [user_controller(place, usual) for place in arguments.controller], given_agents(arguments)
-    controllers, shipped = TASKS[arguments.env].controllers(), shipped_names(arguments.env)
+    controllers, shipped = TASKS[arguments.env].controllers(), shipped_names(arguments.env, on_request=True)
     known = [*(each.name for each in controllers), *(name for name in given if name not in shipped), *shipped]
     check_apart([*known, *(each.name for each in own)], "controller")
-    wanted = wanted_names(arguments, cases, [*given] or ([] if arguments.puller else shipped))
+    wanted = wanted_names(arguments, cases, [*given] or ([] if arguments.puller else shipped_names(arguments.env)))
     for name in wanted:
         if name not in known:
             raise CzError(unknown_name_message("controller", name, known, ", or all"))
@@ -177,7 +178,7 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
 def agents_of(given: Mapping[str, Contender], shipped: Sequence[str], wanted: Sequence[str]) -> list[Contender]:
     """Return the agents of the user's files, then the shipped ones that are wanted and that no file replaces."""
     files = {name: shipped_seeds(name) for name in shipped if name in wanted and name not in given}
-    return [*given.values(), *(agent(name, [*map(OnnxPolicy.load, some)]) for name, some in files.items())]
+    return [*given.values(), *(agent(name, [*map(load_agent, some)]) for name, some in files.items())]
 
 
 def check_quick(chosen: Sequence[Contender], arguments: argparse.Namespace, cases: Sequence[Case]) -> None:
@@ -213,7 +214,7 @@ def given_agents(arguments: argparse.Namespace) -> dict[str, Contender]:
     for name, file in arguments.agent:
         if str(file) in shipped_names(arguments.env) and not file.exists():
             raise CzError(f"--agent takes a file; {file} is shipped and runs by its name: --controllers {file}")
-        policy = OnnxPolicy.load(file)
+        policy = load_agent(file, chosen_puller(arguments.puller), arguments.controller)
         policies.setdefault(name or policy.contract.algorithm, []).append(policy)
     return {name: agent(name, some, own=True) for name, some in policies.items()}
 

@@ -1,8 +1,14 @@
 """Controllers by name: the classical ones of each environment, and those that tools choose by themselves."""
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
 from functools import partial
+from inspect import signature
+from pathlib import Path
 
+from cz_gym.agents.contract import OnnxPolicy, read_agent
+from cz_gym.agents.residual import Base
 from cz_gym.baselines import tuned_controllers as tuned
 from cz_gym.baselines.clairvoyant import Clairvoyant
 from cz_gym.baselines.lqg import LQG, LQGDesign, full_information, privileged
@@ -11,10 +17,12 @@ from cz_gym.baselines.policy import OpenLoop, Policy
 from cz_gym.baselines.scaling import scale_crystal
 from cz_gym.baselines.tuned import TunedController
 from cz_gym.body.process import BODY
-from cz_gym.config import Config, check_config
+from cz_gym.config import Config, check_config, make_config
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.evaluation.protocol import Contender, unchanged
+from cz_gym.episodes.scenarios import RANDOMIZED
+from cz_gym.evaluation.protocol import Contender, unchanged, user_controller
 from cz_gym.process import Process
+from cz_gym.puller.file import PullerFile
 from cz_gym.support.errors import CzError, unknown_name_message
 
 
@@ -126,3 +134,38 @@ def make_controller(name: str, config: Config) -> Policy:
     """The controller of that name for an environment; CzError lists the known ones for another name."""
     controller: Policy = find_controller(name, check_config(config).process).make(config)
     return controller
+
+
+def make_base(name: str, config: Config) -> Base:
+    """The controller of that name, or at FILE.py:NAME, for an agent to add to in an environment (its puller and control
+    interval); it is the one for the scenario "randomized" whatever the scenario is. CzError if none can be added to.
+    """
+    design = replace(config.with_scenario(RANDOMIZED), observation="measured", action="direct")
+    file, own, _ = name.rpartition(":")
+    contender = user_controller(name, design) if own else find_controller(name, design.process)
+    if contender.bound or contender.action != "direct" or contender.observation not in ("measured", "history"):
+        raise CzError(f"{name}: an agent adds to controllers that read sensors and act directly")
+    if own:
+        content = Path(file).read_bytes()
+    else:  # what belongs to the plant is in the agent's contract
+        controller, plant = contender.make(design), signature(make_config).parameters
+        names = [each.name for each in fields(controller) if each.name not in plant]
+        content = repr([(each, getattr(controller, each)) for each in names]).encode()
+    return Base(f"{Path(name).name} {hashlib.sha256(content).hexdigest()[:16]}", contender.make, design)
+
+
+def load_agent(path: str | Path, puller: PullerFile | None = None, controllers: Sequence[str] = ()) -> OnnxPolicy:
+    """An agent file, with the controller that it adds to if there is one.
+
+    A controller of the user's own must be among those given by their places, FILE.py:NAME: no agent file has code run
+    that was not named. AgentFileError or CzError says why the agent is refused.
+    """
+    contract, _ = read_agent(Path(path))
+    name, _, _ = contract.controller.rpartition(" ")
+    if not name:
+        return OnnxPolicy.load(path)
+    place = next((each for each in controllers if Path(each).name == name), name)
+    if place not in controllers and ":" in name:
+        raise CzError(f"{path}: adds to the controller {name}: name its file too, --controller FILE.py:NAME")
+    config = make_config("randomized", puller=puller, control_interval=contract.control_interval)
+    return OnnxPolicy.load(path, base=make_base(place, config))

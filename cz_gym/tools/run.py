@@ -10,7 +10,6 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -384,7 +383,7 @@ def _provenance(benchmark: Benchmark, command: str) -> dict[str, Any]:
         "horizon_s": config.horizon,
         "scenarios": {case.name: _crystals(case, benchmark.seeds(case)) for case in benchmark.cases},
         "controllers": {each.name: {name: getattr(each, name) for name in FACTS} for each in contenders},
-        "agents": [asdict(policy.contract) for each in contenders for policy in each.trained],
+        "agents": [policy.contract.facts for each in contenders for policy in each.trained],
         "bootstrap": {"resamples": RESAMPLES, "seed": SEED, "paired_against": REFERENCE},
         "gap_measured_from": BOUND,
         "gap_from_cached_episodes": {

@@ -9,7 +9,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cz_gym.agents.recipes import CRYSTAL_ENV, CRYSTAL_RECIPES, DEFAULT_RECIPE, FEW_UPDATES, RECIPES, TrainingConfig
+from cz_gym.agents.recipes import (
+    CRYSTAL_ENV,
+    CRYSTAL_RECIPES,
+    DEFAULT_RECIPE,
+    FEW_UPDATES,
+    RECIPES,
+    PPOResidual,
+    TrainingConfig,
+)
+from cz_gym.agents.residual import Base
 from cz_gym.agents.train import read_settings
 from cz_gym.config import check_config
 from cz_gym.crystal.process import ENVIRONMENTS
@@ -19,7 +28,7 @@ from cz_gym.support.command_line import OneLineParser, between, interpreter, run
 from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.files import check_writable, locked
 
-from .registry import make_controller
+from .registry import make_base, make_controller
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
@@ -101,7 +110,7 @@ def train(arguments: argparse.Namespace) -> int:
     where = f"{recipe.environment} ({', '.join(recipe.stages)}), " if recipe.environment else ""
     crystals = {ALL.name: "all"}.get(recipe.config.scenario.name, recipe.config.scenario.name)
     print(f"{recipe.name}, {amount} on {where}{crystals}{machine}, into {arguments.out}", flush=True)
-    options = _measure_references(recipe), arguments.checkpoint_seconds, arguments.plot, callbacks
+    options = _measure_references(recipe), arguments.checkpoint_seconds, arguments.plot, callbacks, _base_of(recipe)
     runs = [TrainingRun(folder, recipe, seed, *options) for folder, seed in zip(folders, seeds, strict=True)]
     if not arguments.seeds:
         with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, disable=None) as bar:
@@ -114,6 +123,10 @@ def train(arguments: argparse.Namespace) -> int:
             bar.write(f"seed {run.seed}: {_summary_line(summary)}")
     print(f"wrote agent.onnx into {len(runs)} folders of {arguments.out}")
     return 0
+
+
+def _base_of(recipe: TrainingConfig) -> Base | None:
+    return make_base(recipe.controller, recipe.config) if isinstance(recipe, PPOResidual) else None
 
 
 def _measure_references(recipe: TrainingConfig) -> Any:

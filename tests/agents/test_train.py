@@ -18,7 +18,7 @@ from tqdm import tqdm
 from cz_gym import CzEnv
 from cz_gym.agents import AgentFileError, OnnxPolicy, load, recipes
 from cz_gym.agents import train as training
-from cz_gym.agents.recipes import CRYSTAL_RECIPES, PPO, RECIPES, make_algorithm
+from cz_gym.agents.recipes import CRYSTAL_RECIPES, PPO, RECIPES, PPOResidual, make_algorithm
 from cz_gym.agents.train import CHECKPOINT, TrainingRun, load_checkpoint, restore, to_bytes
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
@@ -26,7 +26,7 @@ from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.support.command_line import interpreter
 from cz_gym.tools import train
-from cz_gym.tools.registry import make_controller
+from cz_gym.tools.registry import make_base, make_controller
 from tests.small_learners import QUICK, REFERENCES, SMALL, SMALL_APG, SMALL_SAC, SmallRun, learned, train_small, trained
 
 ALONG = {name: getattr(CRYSTAL_RECIPES["ppo"], name) for name in ("environment", "stages", "scenario")}
@@ -380,7 +380,8 @@ def test_no_two_training_seeds_meet_the_same_crystals(name):
 @pytest.mark.parametrize("name", RECIPES)
 def test_the_numbers_of_a_recipe_reach_its_algorithm(name):
     recipe = replace(RECIPES[name], num_envs=64)
-    algorithm = make_algorithm(recipe, 0)
+    base = make_base(recipe.controller, recipe.config) if isinstance(recipe, PPOResidual) else None
+    algorithm = make_algorithm(recipe, 0, 0, base)
     given = 0
     for field, wanted in asdict(recipe).items():
         found = getattr(algorithm, f"{field}_schedule", getattr(algorithm, field, None))
