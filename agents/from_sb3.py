@@ -247,7 +247,7 @@ def to_agent(
     """Make an agent called ``name`` of the algorithm's policy, not validated yet; ``path`` names it in errors."""
     policy, env = algorithm.policy, algorithm.get_env()
     loop = None if env is None else unwrap_vec_wrapper(env, AddToController)
-    residual: Residual | None = loop and loop.residual
+    residual: Residual | None = None if loop is None else loop.residual
     width = len(observations(config.process)[config.observation]) + (residual.width if residual else 0)
     content = to_onnx(policy, width, normalisation)
     contract = make_contract(

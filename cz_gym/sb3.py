@@ -260,7 +260,7 @@ class AddToController(VecEnvWrapper):
             infos[i]["terminal_observation"] = np.concatenate([self.added[i], infos[i]["terminal_observation"]])
         return self._shown(observation, done), reward, done, infos
 
-    def _shown(self, observation: np.ndarray, begins: np.ndarray) -> np.ndarray:
+    def _shown(self, observation: Any, begins: np.ndarray) -> np.ndarray:
         self.added, self.memory = self.residual.read(observation, self.memory, begins)
         return np.concatenate([self.added, observation], axis=1)
 
