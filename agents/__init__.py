@@ -56,17 +56,15 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'cz_gym.agents' has no attribute {name!r}")
 
 
-def shipped_names(environment: str = "Cz-v0", on_request: bool = False) -> list[str]:
-    """Names of the trained agents that come with the package for an environment; ``on_request`` those too that add to a
-    controller, which the benchmark runs if they are named.
-    """
-    names = sorted({path.stem.rpartition("-seed")[0] for path in MODELS.glob(f"{'**/' * on_request}*-seed*.onnx")})
+def shipped_names(environment: str = "Cz-v0") -> list[str]:
+    """Names of the trained agents that come with the package for an environment."""
+    names = sorted({path.stem.rpartition("-seed")[0] for path in MODELS.glob("*-seed*.onnx")})
     return [name for name in names if read_agent(shipped_seeds(name)[0])[0].environment == environment]
 
 
 def shipped_seeds(name: str = DEFAULT) -> list[Path]:
     """Paths of the shipped agents of that name, by training seed; AgentFileError lists the names there are."""
-    paths = {int(path.stem.removeprefix(f"{name}-seed")): path for path in MODELS.glob(f"**/{name}-seed[0-9]*.onnx")}
+    paths = {int(path.stem.removeprefix(f"{name}-seed")): path for path in MODELS.glob(f"{name}-seed[0-9]*.onnx")}
     if not paths:
         known = [each for environment in ENVIRONMENTS for each in shipped_names(environment)]
         raise AgentFileError(unknown_name_message("shipped agent", name, known))

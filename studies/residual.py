@@ -1,4 +1,4 @@
-"""The worth of learning beside a given PID: ``python -m studies.residual`` compares both on validation crystals.
+"""Learning beside a given PID: ``python -m studies.residual FILE...`` compares agents with it on validation crystals.
 
 Each agent adds to the PID that it was trained on, within its limits; that PID alone stands beside it, and the one that
 is tuned for each scenario, which is told more.
@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cz_gym.agents import shipped_seeds
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS, find_case
 from cz_gym.evaluation.rollout import rollout
@@ -22,7 +21,6 @@ from cz_gym.tools.report.tables import markdown
 
 from .common import StudyParser
 
-AGENT = "pid-with-learning"
 SCENARIOS = "randomized", "hard", "sensor-fault", "puller", "hot-zone"
 JUDGED = VALIDATION_SEEDS[264:]
 """Seeds of crystals that no training run has chosen or judged its agent by."""
@@ -52,20 +50,19 @@ def rows(files: Sequence[Path], crystals: int) -> Iterator[tuple[str, ...]]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = StudyParser("residual", __doc__, "results/residual")
-    parser.add_argument("files", nargs="*", type=Path, help=f"agent files, one a training seed ({AGENT}'s)")
+    parser.add_argument("files", nargs="+", type=Path, help="agent files (.onnx), one a training seed")
     parser.add_argument("--crystals", type=between(1, len(JUDGED)), default=100, help="of each scenario (%(default)s)")
     return parser.run(_main, arguments)
 
 
 def _main(given: argparse.Namespace) -> None:
-    files = given.files or shipped_seeds(AGENT)
-    contract = load_agent(files[0]).contract
+    contract = load_agent(given.files[0]).contract
     about = (
         f"{given.crystals} validation crystals of each scenario. The agent adds to `{contract.controller}`, whose "
         f"settings are those for `randomized`, at most {100 * contract.pull_limit:g} % of the nominal pull speed and "
         f"{contract.heater_limit:g} kW; it learned for {contract.training_steps / 1e6:g} million steps."
     )
-    table = markdown(HEADS, [*rows(files, given.crystals)])
+    table = markdown(HEADS, [*rows(given.files, given.crystals)])
     write_files({given.out / "table.md": f"# Learning beside a PID\n\n{about}\n\n{table}\n".encode()})
     print(table)
 

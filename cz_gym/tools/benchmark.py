@@ -159,10 +159,10 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
     """
     usual = cases[0].design_config() if cases else None
     own, given = [user_controller(place, usual) for place in arguments.controller], given_agents(arguments)
-    controllers, shipped = TASKS[arguments.env].controllers(), shipped_names(arguments.env, on_request=True)
+    controllers, shipped = TASKS[arguments.env].controllers(), shipped_names(arguments.env)
     known = [*(each.name for each in controllers), *(name for name in given if name not in shipped), *shipped]
     check_apart([*known, *(each.name for each in own)], "controller")
-    wanted = wanted_names(arguments, cases, [*given] or ([] if arguments.puller else shipped_names(arguments.env)))
+    wanted = wanted_names(arguments, cases, [*given] or ([] if arguments.puller else shipped))
     for name in wanted:
         if name not in known:
             raise CzError(unknown_name_message("controller", name, known, ", or all"))
