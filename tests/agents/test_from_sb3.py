@@ -226,7 +226,7 @@ def test_a_file_that_would_act_otherwise_is_not_written(tmp_path):
         ("good.zip --algo ppo --out mine.pt", "ends in .onnx"),
         ("good.zip --algo ppo --out mine.onnx --observation measured", "shape (73,)"),
         ("good.zip --algo ppo --out mine.onnx --vecnormalize broken.zip", "broken.zip: not a VecNormalize"),
-        ("good.zip --algo ppo --out mine.onnx --seed -1", "training_seed"),
+        ("good.zip --algo ppo --out mine.onnx --seed -1", "--seed"),
     ],
 )
 def test_a_wrong_command_is_refused_in_one_line(arguments, said, tmp_path, monkeypatch, refused):
