@@ -228,8 +228,9 @@ def test_the_finding_tells_those_who_are_told_apart_and_says_how_much_each_moves
     assert finding(made(cases, *who)) == (
         "Of controllers that are not told which scenario they meet, the agent `agent` ranks first by crystals lost, "
         "then by cost: cost 0.2010 and 0.2010 on `randomized` and `hard`, against 0.4020 and 0.4020 of the classical "
-        "controller `free`. Told it, `told` has 0.1005 and 0.1005; on `randomized` the three are 0.800, 0.600 and "
-        "0.900 mm off (RMSE) and move the pull speed by 0.3000, 0.2000 and 0.5000 mm/min (RMS) a sample."
+        "controller `free`. The best of those that are told have 0.1005 (`told`) and 0.1005 (`told`). On `randomized` "
+        "`agent`, `free` and `told` are 0.800, 0.600 and 0.900 mm off (RMSE) and move the pull speed by 0.3000, 0.2000 "
+        "and 0.5000 mm/min (RMS) a sample."
     )
     assert finding(made(cases, *who[1:])) == ""
     assert "by cost, within the intervals: cost 0.4" in finding(made(cases, *who[:3], (who[3][0], steps(0.399, 0.3))))

@@ -157,15 +157,17 @@ def brief(benchmark: Benchmark) -> str:
 
 
 def _firsts(benchmark: Benchmark, cases: Sequence[Case]) -> list[Contender]:
-    """Who ranks first of agents and of classical controllers that are not told the scenario, in order, and of the told.
+    """Return who ranks first of the agents and of the classical controllers that are not told the scenario, in order,
+    and on each scenario of those that are.
 
-    Fewer than three where such controllers did not take part; bounds left out.
+    Shorter where such controllers did not take part; bounds left out.
     """
-    able = sorted(benchmark.contenders, key=lambda each: benchmark.rank(cases, each.name))
-    groups: dict[str, Contender] = {}
-    for each in (each for each in able if not each.bound):
-        groups.setdefault("told" if each.told else "learned" if each.learned else "classical", each)
-    return sorted(groups.values(), key=lambda each: each.told)
+    able = [each for each in benchmark.contenders if not each.bound]
+    told = [each for each in able if each.told]
+    kinds = [[each for each in able if not each.told and each.learned is learned] for learned in (True, False)]
+    firsts = [min(kind, key=lambda each: benchmark.rank(cases, each.name)) for kind in kinds if kind]
+    firsts.sort(key=lambda each: benchmark.rank(cases, each.name))
+    return [*firsts, *(min(told, key=lambda each: benchmark.rank([case], each.name)) for case in cases if told)]
 
 
 def finding(benchmark: Benchmark) -> str:
@@ -178,12 +180,13 @@ def finding(benchmark: Benchmark) -> str:
     if graded or tables.too_few(benchmark):
         return ""
     firsts = _firsts(benchmark, cases)
-    if len(firsts) < 3:
+    if len(firsts) < 2 + len(cases):
         return ""
-    best, other, told = firsts
+    best, other, *told = firsts
     cost, error, step = (each._replace(interval=False) for each in (tables.COST, tables.RMSE, tables.PULL_STEP))
-    costs = [" and ".join(cost.of(benchmark, case, each.name) for case in cases) for each in firsts]
-    moves = [column.of(benchmark, cases[0], each.name) for column in (error, step) for each in firsts]
+    costs = [" and ".join(cost.of(benchmark, case, each.name) for case in cases) for each in (best, other)]
+    aware = [f"{cost.of(benchmark, case, each.name)} (`{each.name}`)" for case, each in zip(cases, told, strict=True)]
+    moves = [column.of(benchmark, cases[0], each.name) for column in (error, step) for each in firsts[:3]]
     get: Any = benchmark.get
     clear = all(get(case, best.name, "cost").ends[1] < get(case, other.name, "cost").ends[0] for case in cases)
     kinds = ["the agent" if each.learned else "the classical controller" for each in (best, other)]
@@ -191,8 +194,9 @@ def finding(benchmark: Benchmark) -> str:
         f"Of controllers that are not told which scenario they meet, {kinds[0]} `{best.name}` ranks first by crystals "
         f"lost, then by cost{'' if clear else ', within the intervals'}: cost {costs[0]} on "
         f"{' and '.join(f'`{case.name}`' for case in cases)}, against {costs[1]} of {kinds[1]} `{other.name}`. "
-        f"Told it, `{told.name}` has {costs[2]}; on `{cases[0].name}` the three are "
-        "{}, {} and {} mm off (RMSE) and move the pull speed by {}, {} and {} mm/min (RMS) a sample.".format(*moves)
+        f"The best of those that are told have {' and '.join(aware)}. On `{cases[0].name}` `{best.name}`, "
+        f"`{other.name}` and `{told[0].name}` "
+        "are {}, {} and {} mm off (RMSE) and move the pull speed by {}, {} and {} mm/min (RMS) a sample.".format(*moves)
     )
 
 
