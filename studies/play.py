@@ -48,7 +48,7 @@ PULL_UNIT = 1e-3 * MM_PER_MIN
 
 
 def content(config: Config, seeds: Sequence[int], rivals: Sequence[str] = RIVALS) -> dict[str, Any]:
-    """What the page holds of these crystals: numbers in SI units, arrays as base64 of little-endian numbers."""
+    """Content of the page about these crystals: numbers in SI units, arrays as base64 of little-endian numbers."""
     speed, power = config.ranges
     task = {
         "interval": config.control_interval, "steps": config.steps, "grid": GRID, "scenario": config.scenario.name,

@@ -46,7 +46,7 @@ FIXED = Scenario(
     interface=Interface(sd=(FLUCTUATION, FLUCTUATION)),
     sensor=Sensor(camera_noise=(CAMERA, CAMERA), pyrometer_noise=(PYROMETER, PYROMETER)),
 )
-"""What the limit is computed for: fluctuations and noise of these sizes, a puller that is known, nothing else."""
+"""Conditions of the limit: fluctuations and noise of these sizes, a puller that is known, nothing else."""
 MIX = 0.5
 NOISES = (0.005 * MM, 0.015 * MM, CAMERA, 0.06 * MM, 0.12 * MM)
 GAINS = (0.25, 0.5, 1.0, 2.0, 4.0)

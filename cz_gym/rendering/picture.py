@@ -116,7 +116,7 @@ class Record:
 
     @property
     def camera_sees(self) -> str:
-        """What the camera reads now: "ring", "edge", or "" where nothing."""
+        """Reading that the camera has now: "ring", "edge", or "" for none."""
         return "ring" if self.last("valid") > 0.0 else ""
 
     @property
@@ -202,7 +202,7 @@ class CrystalRecord(Record):
 
     @property
     def camera_sees(self) -> str:
-        """What the camera reads now: "ring", "edge", or "" where nothing."""
+        """Reading that the camera has now: "ring", "edge", or "" for none."""
         return "edge" if self.last("edge_valid") > 0.0 else super().camera_sees
 
     @property

@@ -110,7 +110,8 @@ def train(arguments: argparse.Namespace) -> int:
     where = f"{recipe.environment} ({', '.join(recipe.stages)}), " if recipe.environment else ""
     crystals = {ALL.name: "all"}.get(recipe.config.scenario.name, recipe.config.scenario.name)
     print(f"{recipe.name}, {amount} on {where}{crystals}{machine}, into {arguments.out}", flush=True)
-    options = _measure_references(recipe), arguments.checkpoint_seconds, arguments.plot, callbacks, _base_of(recipe)
+    base = _base_of(recipe)  # a wrong controller is refused before the work
+    options = _measure_references(recipe), arguments.checkpoint_seconds, arguments.plot, callbacks, base
     runs = [TrainingRun(folder, recipe, seed, *options) for folder, seed in zip(folders, seeds, strict=True)]
     if not arguments.seeds:
         with tqdm(total=recipe.steps, unit="step", unit_scale=True, dynamic_ncols=True, disable=None) as bar:

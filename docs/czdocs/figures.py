@@ -176,7 +176,7 @@ def crown() -> Figure:
 
 
 def camera() -> Figure:
-    """What the camera sees: the bright ring of a body, and in the crown the crystal's edge alone."""
+    """Images of the camera: the bright ring of a body, and in the crown the crystal's edge alone."""
     figure = canvas(8.0, 3.3)
     body = CzEnv("nominal", observation="camera")
     widening = CzCrystalEnv(stage=0.05, scenario="nominal", observation="camera")

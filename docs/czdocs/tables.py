@@ -152,7 +152,7 @@ def camera() -> list[str]:
 
 
 def exported() -> list[str]:
-    """What the study of exported C found: each controller's largest difference of an action, and rows that differ."""
+    """Findings of the study of exported C: each controller's largest difference of an action, and rows that differ."""
     by_name: dict[tuple[str, str], list[Any]] = {}
     for row in json.loads((DOCS.parent / "results" / "export" / "export.json").read_text())["rows"]:
         by_name.setdefault((code(row["controller"]), row["real"]), []).append(row)
