@@ -107,6 +107,8 @@ class APG(TrainingConfig):
     action: str = "rate"
     window: int = 180
     """Steps of a crystal that a gradient goes back through."""
+    units: int = 64
+    """Width of the memory (a gated recurrent unit) and of the hidden layer."""
     fewest_updates: int = 400
     betas: tuple[float, float] = (0.9, 0.9)
     """Adam's decays. The first gradients, of lost crystals, are a thousand times those that follow: their squares must
@@ -178,6 +180,7 @@ class PPOResidual(PPO):
     """PPO of additions to a given controller, within limits (:mod:`cz_gym.agents.residual`)."""
 
     name: str = "pid-with-learning"
+    steps: int = 24_000_000
     action: str = "direct"
     controller: str = "pid-conventional"
     """Name of the controller, or FILE.py:NAME."""
@@ -253,7 +256,8 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base 
     options = dict[str, Any]()
     match recipe:
         case APG():
-            kind, policy, options = apg.APG, "RecurrentPolicy", {"betas": recipe.betas}
+            kind, policy = apg.APG, "RecurrentPolicy"
+            options = {"betas": recipe.betas, "units": recipe.units, "hidden": recipe.units}
         case PPO():
             kind, policy, critics = stable_baselines3.PPO, AsymmetricPolicy if told else "MlpPolicy", "vf"
             options = {"log_std_init": recipe.log_std_init}
