@@ -1,6 +1,8 @@
-"""Studies on small runs: model cards, the frontier, the leaderboard, speed, stock learners, robustness."""
+"""Studies on small runs: cards, frontier, leaderboard, speed, stock learners, robustness; README's first screen."""
 
+import io
 import json
+import re
 import shutil
 import timeit
 from functools import partial
@@ -11,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from PIL import Image
 
 from cz_gym import agents, make_puller
 from cz_gym.body.process import radius_model
@@ -19,7 +22,8 @@ from cz_gym.evaluation.protocol import CASES, TRAINING_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.tools import leaderboard
 from cz_gym.tools.report.task_records import contract_hash
-from studies import cards, frontier, ranks, robustness, speed, stock
+from studies import cards, frontier, picture, ranks, robustness, speed, stock
+from tests.conftest import ROOT
 
 FIGURES = {key: {"mean": 0.0, "ci95": [0.0, 0.5]} for key in (*(of.metric for of in cards.FIGURES), cards.RETURN)}
 
@@ -270,3 +274,47 @@ def test_ranks_write_their_table_and_figure(tmp_path):
     table = (tmp_path / "table.md").read_text()
     assert all(f"| {each.about} | " in table for each in ranks.variants())
     assert (tmp_path / "ranks.png").read_bytes().startswith(b"\x89PNG")
+
+
+# README's moving picture, its result and its words
+
+README = ROOT / "README.md"
+
+
+def test_a_frame_shows_both_sides_and_the_picture_moves():
+    frames = [*picture.frames(time=60.0)]
+    assert {frame.shape for frame in frames} == {(picture.SIZE[1], 2 * picture.SIZE[0], 3)}
+    assert len(frames) == 12 // picture.EVERY
+    assert np.abs(frames[0].astype(int) - frames[-1]).max() > 100
+    with Image.open(io.BytesIO(picture.moving(frames))) as image:
+        assert (image.format, image.n_frames) == ("GIF", len(frames))
+
+
+def test_the_committed_results_fill_pages_and_pictures_again(tmp_path, monkeypatch):
+    page, results = tmp_path / "page.md", tmp_path / "benchmark.json"
+    page.write_text("a <!-- finding:begin --><!-- finding:end --> b <!-- benchmark:begin --><!-- benchmark:end -->")
+    results.write_bytes((ROOT / "results" / "benchmark" / "benchmark.json").read_bytes())
+    monkeypatch.setattr(picture, "PAGES", [page])
+    assert picture.main([str(results)]) == 0
+    (said,) = re.findall(r"begin -->\n(Of controllers that are not told .*)\n<!-- finding:end", page.read_text())
+    assert said in README.read_text()
+    for name in ("result.svg", "pareto.svg"):
+        assert (tmp_path / name).read_bytes() == (ROOT / "results" / "benchmark" / name).read_bytes()
+
+
+def test_readmes_first_screen_is_short_and_light():
+    text = README.read_text()
+    words = re.sub(r"```.*?```|<!--.*?-->|\]\([^)]*\)", " ", text, flags=re.DOTALL)
+    assert len(re.findall(r"\w[\w.'-]*", words)) <= 450
+    assert text[: text.index("```")].count("\n") < 40
+    pictures = [ROOT / name for name in re.findall(r"!\[[^]]+\]\(([^)]+)\)", text)]
+    assert [each.name for each in pictures] == ["lost-and-held.gif", "result.svg"]
+    assert sum(each.stat().st_size for each in pictures) < 1_500_000
+
+
+@pytest.mark.parametrize("name", ["benchmark", "crystal", "bounds", "frontier"])
+def test_every_report_shows_its_pictures(name):
+    folder = ROOT / "results" / name
+    shown = re.findall(r"^!\[[^]]+\]\(([^)]+)\)$", (folder / "report.md").read_text(), re.MULTILINE)
+    assert "pareto.svg" in shown
+    assert all((folder / each).is_file() for each in shown)
