@@ -2,8 +2,9 @@
 
 Every controller's block grows the same crystals without and with each fault: calls that come early, late or unevenly, a
 pyrometer that is gone for two hours or drifts, nominal values that are off, drives that stand still or are read wrong,
-a ring that steps or gets stuck. The environment runs at half
-of the block's interval, and the ring's time is that of its frame.
+a ring that steps or gets stuck. The environment runs at half of the block's interval, and the ring's time is that of
+its frame. Where drives are read wrong, the scenario's own errors of their readings are left out: each error stands
+alone, beside "drives read exactly". Agents grow under these faults.
 """
 
 from __future__ import annotations
@@ -13,16 +14,17 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from cz_gym.agents import shipped_names
 from cz_gym.config import make_config
+from cz_gym.episodes.scenario import DriveReadings
 from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.support.command_line import OneLineParser, between
-from cz_gym.support.files import check_writable, write_files
+from cz_gym.support.command_line import between
+from cz_gym.support.files import write_files
 from cz_gym.support.units import HOUR, MINUTE, MM
 from cz_gym.tools.export.block import SETPOINT_NAMES, Alarm
 from cz_gym.tools.export.controllers import make_block
@@ -30,7 +32,9 @@ from cz_gym.tools.export.shell import Block, BlockPolicy, Runner
 from cz_gym.tools.export.text import CompiledBlock
 from cz_gym.tools.report.tables import markdown
 
-CONTROLLERS, CRYSTALS = ("lqg-at-0.02", "paper-tuned", "fallback"), 100
+from .common import StudyParser
+
+CONTROLLERS, CRYSTALS = ("lqg-at-0.02", "paper-tuned", "fallback", "gradient"), 100
 GONE = 0.5 * HOUR, 2.5 * HOUR
 """When a pyrometer is gone [s]."""
 STILL = 1.0 * HOUR, 1.0 * HOUR + 10.0 * MINUTE
@@ -96,7 +100,13 @@ class Fault(NamedTuple):
     drift: float = 0.0
     """Drift of the pyrometer [K/h]."""
 
+    @property
+    def of_readings(self) -> bool:
+        """True if the drives are read in another way than the scenario has it."""
+        return self.reads is not None or self.delay > 0
 
+
+EXACT = "drives read exactly"
 UNEVEN = tuple(np.random.default_rng(0).integers(1, 5, 997) / 2.0)
 FAULTS = {
     "none": Fault(),
@@ -111,6 +121,7 @@ FAULTS = {
     "nominal values too high": Fault(off=1.0),
     "nominal values too low": Fault(off=-1.0),
     "drives stand still": Fault(still=True),
+    EXACT: Fault(reads=(Reading(), Reading())),
     "pull reads 0.97": Fault(reads=(Reading(0.97), Reading())),
     "pull reads 1.03": Fault(reads=(Reading(1.03), Reading())),
     "pull reads -2 % of its range": Fault(reads=(Reading(offset=-0.02 * FULL[0]), Reading())),
@@ -202,6 +213,8 @@ def grow(block: Block, fault: str, crystals: int, runner: Runner | None = None, 
     """Grow test crystals with a block, or what runs it, under the fault of that name."""
     interval = 0.5 * block.config.control_interval
     config = replace(block.config, control_interval=interval, horizon=horizon)
+    if FAULTS[fault].of_readings:
+        config = replace(config, scenario=replace(config.sole_scenario, readings=DriveReadings()))
     faulty = Faulty(block, runner or block, FAULTS[fault])
     run = rollout(BlockPolicy(block, faulty, interval), config, TEST_SEEDS[:crystals])
     error = (run.signals.r_c - run.signals.r_ref)[round(SETTLED / interval) :, ~run.failed] / MM
@@ -215,40 +228,45 @@ def report(rows: Mapping[tuple[str, str], Row], crystals: int) -> str:
     """The table, by controller and fault."""
     lines = []
     for (controller, fault), row in rows.items():
-        share = row.rmse / rows[controller, "none"].rmse
+        share = row.rmse / rows[controller, EXACT if FAULTS[fault].of_readings else "none"].rmse
         lost = f"{row.lost} ({row.helpless})" if row.helpless else str(row.lost)
         names = ", ".join(bit.name or "" for bit in row.alarms)
         lines.append((controller, fault, f"{row.rmse:.3f}", f"{share:.2f}", lost, f"{row.limited:.1%}", names))
-    heads = "controller", "fault", "RMSE [mm]", "of none", "lost", "limited", "alarms"
+    heads = "controller", "fault", "RMSE [mm]", "ratio", "lost", "limited", "alarms"
     return f"""# Blocks under the faults of a plant
 
 {crystals} test crystals of three hours each, errors from half an hour on, of those that were kept. In brackets: those
 of the lost that were lost while the drives stood still, when no block acts. Limited: share of the time with a bit that
-says so.
+says so. Ratio: to the error without a fault, or with drives that read exactly.
 
 {markdown(heads, lines)}
 """
 
 
+def faults_of(name: str) -> list[str]:
+    """The faults under which a controller's block grows: an agent's those of the drives' readings."""
+    agents = shipped_names()
+    return [fault for fault, each in FAULTS.items() if name not in agents or each.of_readings]
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser("python -m studies.faults", "Blocks in compiled C under the faults of a plant.")
-    add = parser.add_argument
-    add("--out", type=Path, default=Path("results/faults"), metavar="FOLDER", help="%(default)s")
-    add("--crystals", type=between(1, 500), default=CRYSTALS, metavar="N", help="test crystals (%(default)s)")
+    parser = StudyParser("faults", "Blocks in compiled C under the faults of a plant.", "results/faults")
+    parser.add_argument("controllers", nargs="*", help=f"names ({', '.join(CONTROLLERS)})")
+    about = "test crystals (%(default)s)"
+    parser.add_argument("--crystals", type=between(1, 500), default=CRYSTALS, metavar="N", help=about)
     return parser.run(_main, arguments, "plant")
 
 
 def _main(given: argparse.Namespace) -> None:
-    check_writable(given.out)
     rows: dict[tuple[str, str], Row] = {}
-    for name in CONTROLLERS:
+    for name in given.controllers or CONTROLLERS:
         block = make_block(name, make_config("puller", observation="measured", action="direct"))
         runner = CompiledBlock(block)
-        for fault in FAULTS:
+        for fault in faults_of(name):
             rows[name, fault] = grow(block, fault, given.crystals, runner)
             print(name, fault, *rows[name, fault], flush=True)
-    write_files({given.out / "report.md": report(rows, given.crystals).encode()})
+        write_files({given.out / "report.md": report(rows, given.crystals).encode()})
 
 
 if __name__ == "__main__":

@@ -141,13 +141,13 @@ def copied(*paths: str) -> Lines:
 
 def faults() -> Lines:
     """Radius error and lost crystals of each block under each fault."""
-    cells: dict[str, list[str]] = {}
-    controllers = dict[str, None]()
+    cells: dict[str, dict[str, tuple[str, str]]] = {}
     for controller, fault, error, _, lost, *_ in rows_of("faults/report.md")[1:]:
-        controllers[controller] = None
-        cells.setdefault(fault, []).extend((error, lost))
+        cells.setdefault(fault, {})[controller] = error, lost
+    controllers = dict.fromkeys(name for row in cells.values() for name in row)
     head = [each for name in controllers for each in (f"{code(name)} [mm]", "lost")]
-    return table(("fault", *head), ((fault, *row) for fault, row in cells.items()))
+    rows = ([each for name in controllers for each in row.get(name, ("-", "-"))] for row in cells.values())
+    return table(("fault", *head), ((fault, *row) for fault, row in zip(cells, rows, strict=True)))
 
 
 def record(name: str) -> Any:

@@ -127,12 +127,15 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     no_pyrometer_time = np.where(seen.pyrometer, 0.0, np.where(call.starts, 0.0, memory.no_pyrometer_time) + dt)
     settled_time = np.where(runs & seen.pyrometer & (memory.fallback < 0.5), memory.settled_time + dt, 0.0)
     check = getattr(controller, "model_mismatch", None)
-    mismatch = (settled_time > SETTLED_TIME) & (check(memory.controller) if check else False)
+    unexplained = check(memory.controller) if check else False
+    mismatch = (settled_time > SETTLED_TIME) & unexplained
     fallen, wait = runs & (memory.fallback > 0.5), given["return_after_s"]
+    # A model that lost the crystal without readings begins anew, and is watched for all of the wait.
+    confused = fallen & (memory.stays < 0.5) & unexplained
     distance = np.abs(seen.ring.level - seen.read.r_ref)
     beyond = engaged & finite(seen.ring.level) & (distance > given["radius_limit_mm"] * MM)
     calm = (2.0 * distance < given["radius_limit_mm"] * MM) & (np.abs(memory.pull_bias) < FAR_PULL)
-    good_time = np.where(fallen & good & seen.pyrometer & calm, memory.good_time + dt, 0.0)
+    good_time = np.where(fallen & good & seen.pyrometer & calm & ~confused, memory.good_time + dt, 0.0)
     # What an operator leaves far from nominal is brought back by the PID.
     far = beyond | (np.abs(raw.v_p) > FAR_PULL * given["nominal_pull_speed_mm_per_min"] * MM_PER_MIN)
     begins_far = engaged & ~runs & far & (wait > 0.0)
@@ -153,7 +156,7 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     # The samples of a call have one frame in common, whose noise counts once.
     told = read._replace(T_1=np.where(call.again, np.inf, seen.T_1 - T_1_offset), valid=read.valid / call.samples)
     observes = controller.observes
-    goes_on = runs & ~corrects & (True if observes else ~returns)
+    goes_on = runs & ~corrects & ~confused & (True if observes else ~returns)
     held = memory.controller if goes_on.all() else select(goes_on, memory.controller, controller.at_rest(read))
     own = controller.step(told if estimates else read, held)
     other = own[0], own[1], memory.pid

@@ -292,6 +292,38 @@ def test_a_stuck_ring_costs_no_crystal_and_its_controller_comes_back_without_a_b
     assert Alarm.HEATER_LIMITED not in row.alarms
 
 
+def test_a_filter_that_lost_the_crystal_begins_anew_before_its_controller_returns():
+    """While the fallback controls, the ring's error doubled: a model that readings contradict is no reason to return.
+
+    On test crystal 33 an LQG came back 8 mm off after ten minutes of a stuck ring, and lost the crystal.
+    """
+    block = block_of("lqg")
+    memory = block.start(1)
+    settings = {"return_after_s": 60.0, "fallback_after_s": 20.0, "takeover_s": 0.0}
+    nominal_ring = sum(block.ports[name].default for name in ("nominal_radius_mm", "ring_bias_mm"))
+    puller = in_plant_units(Measured(*np.zeros((len(Measured._fields), 1))), nominal_puller(block.config))
+
+    def sample(at, **given):
+        ring = nominal_ring + 0.01 * (at % 10.0 > 4.0)
+        times = {"time_s": at, "ring_time_s": at, "automatic": 1.0, "ring_radius_mm": ring, "valid": 1.0}
+        warmth = {"T_1_K": puller["T_1_K"] + 0.01 * (at % 10.0 > 4.0)}
+        return block.run(puller | times | warmth | settings | given, memory)
+
+    for at in range(0, 60, 5):
+        outputs, memory = sample(float(at), valid=float(at < 20.0))
+    assert Alarm.FALLBACK in Alarm(int(outputs[ALARMS][0]))
+    far = memory.controller.filter._replace(surprise=np.array([[0.0, 3.0]]), mean=memory.controller.filter.mean + 1e-3)
+    memory = memory._replace(controller=memory.controller._replace(filter=far))
+    outputs, memory = sample(60.0)
+    assert memory.good_time[0] == 0.0
+    assert np.abs(memory.controller.filter.mean[0, 0]) < 1e-4
+    back = []
+    for at in range(65, 140, 5):
+        outputs, memory = sample(float(at))
+        back.append(Alarm.FALLBACK not in Alarm(int(outputs[ALARMS][0])))
+    assert back.index(True) == 11
+
+
 def test_a_shadow_runs_beside_a_log(tmp_path):
     env = CzEnv("puller-frames", observation="measured", action="direct", info="all", horizon=3600.0)
     record_log(env, make_controller("paper-tuned", env.config), tmp_path / "log.csv", seed=1)
