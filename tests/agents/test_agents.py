@@ -34,35 +34,32 @@ def test_every_shipped_agent_is_called_by_how_it_was_made(name):
 def test_an_agent_is_loaded_by_its_file():
     path = agents.shipped_seeds("ppo")[1]
     assert agents.load(path) == agents.load(str(path)) == agents.OnnxPolicy.load(path)
+    assert agents.load("ppo", make_config("hard", **PPO)).settings == PPO
+
+
+PPO = agents.load("ppo").settings
+OTHER = {"action": "rate", "control_interval": 2.0, "observation": "measured"}
 
 
 @pytest.mark.parametrize(
-    ("load", "name", "message"),
+    ("call", "message"),
     [
-        (agents.load, "gradeint", r"unknown shipped agent 'gradeint': did you mean 'gradient'\? Choose from "),
-        (agents.load, "", "unknown shipped agent ''; choose from"),
-        (agents.load, "nobody.onnx", "nobody.onnx: no such file"),
-        (agents.OnnxPolicy.load, "ppo", r"not an \.onnx agent file; cz_gym\.agents\.load\('ppo'\) loads"),
+        (lambda: agents.load("gradeint"), r"unknown shipped agent 'gradeint': did you mean 'gradient'\? Choose from "),
+        (lambda: agents.load(""), "unknown shipped agent ''; choose from"),
+        (lambda: agents.load("nobody.onnx"), "nobody.onnx: no such file"),
+        (lambda: OnnxPolicy.load("ppo"), r"not an \.onnx agent file; cz_gym\.agents\.load\('ppo'\) loads"),
+        *(
+            (lambda to=to: agents.load("ppo", make_config(**PPO | to)), f"made for {name}=.*, this config has {of!r}")
+            for name, of in OTHER.items()
+            for to in [{name: of}]
+        ),
+        (lambda: agents.load("ppo", make_config(process=CRYSTAL, **PPO)), "trained for Cz-v0, not for CzCrystal-v0$"),
     ],
 )
-def test_an_agent_that_does_not_exist_is_refused_in_one_line(load, name, message):
-    with pytest.raises(agents.AgentFileError, match=message) as caught:
-        load(name)
+def test_an_agent_that_does_not_exist_or_was_made_for_something_else_is_refused_in_one_line(call, message):
+    with pytest.raises(AgentFileError, match=message) as caught:
+        call()
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("other", [{"action": "rate"}, {"control_interval": 2.0}, {"observation": "measured"}])
-def test_an_agent_refuses_a_config_that_it_is_not_made_for(other):
-    settings = agents.load("ppo").settings
-    assert agents.load("ppo", make_config("hard", **settings)).settings == settings
-    ((name, value),) = other.items()
-    with pytest.raises(agents.AgentFileError, match=f"ppo is made for {name}=.*, this config has {value!r}"):
-        agents.load("ppo", make_config(**{**settings, **other}))
-
-
-def test_an_agent_of_one_environment_is_refused_by_the_other():
-    with pytest.raises(agents.AgentFileError, match=r"ppo-seed.\.onnx: trained for Cz-v0, not for CzCrystal-v0$"):
-        agents.load("ppo", make_config(process=CRYSTAL, **agents.load("ppo").settings))
 
 
 @pytest.fixture

@@ -55,7 +55,7 @@ def driven(policy, batch, steps):
     ("scenario", "apart", "config"),
     [
         ("randomized", 0.01, CONFIG), ("sensor-fault", 0.01, CONFIG), ("puller", 0.05, CONFIG),
-        ("randomized", 0.01, CRYSTALS),
+        pytest.param("randomized", 0.01, CRYSTALS, marks=pytest.mark.slow),
     ],
 )  # fmt: skip
 def test_the_gradient_is_that_of_differences(scenario, apart, config):
@@ -78,8 +78,12 @@ def test_the_gradient_is_that_of_differences(scenario, apart, config):
 
 
 @pytest.mark.parametrize(
-    ("scenario", "config"), [("all", CONFIG), ("puller", CONFIG), ("sensor-fault", CRYSTALS), ("randomized", CRYSTALS)]
-)
+    ("scenario", "config"),
+    [
+        ("all", CONFIG), ("puller", CONFIG),
+        *(pytest.param(name, CRYSTALS, marks=pytest.mark.slow) for name in ("sensor-fault", "randomized")),
+    ],
+)  # fmt: skip
 def test_the_written_out_gradient_is_autograd_s(scenario, config):
     """Of every weight, through lost crystals, clipped features and held readings too."""
     policy, scene = some_policy(config.process.name), scenarios(scenario)

@@ -32,6 +32,13 @@ class MLP(nn.Module):
         return self.layers(x)
 
 
+class Noisy(MLP):
+    """Draws its actions."""
+
+    def forward(self, x):
+        return super().forward(x) + torch.randn(2)
+
+
 class Cell(nn.Module):
     """A cell of one state, GRU or RNN, or of two, LSTM, which share a vector."""
 
@@ -209,22 +216,15 @@ def test_a_module_is_saved_in_one_call(tmp_path, quick, name):
         (nn.Linear(73, 2), {}, "Linear fails on inputs of shape .2, 12."),
         (MLP(nn.Tanh()), {"learned_from": "nothing"}, "learned_from must be 'reward', 'state' or 'plant'"),
         (lambda x: x, {}, "this needs a Module"),
+        (Noisy(nn.Tanh()), {}, r"RandomNormal|act otherwise than the module"),
     ],
 )
+@pytest.mark.usefixtures("quick")
 def test_a_module_that_is_no_agent_is_refused(tmp_path, module, options, says):
     with pytest.raises(ValueError, match=says) as caught:
         save_agent(tmp_path / "a.onnx", module, CONFIG, **options)
     assert "\n" not in str(caught.value)
     assert not [*tmp_path.iterdir()]
-
-
-def test_a_module_that_draws_its_actions_is_refused(tmp_path, quick):
-    class Noisy(MLP):
-        def forward(self, x):
-            return super().forward(x) + torch.randn(2)
-
-    with pytest.raises(AgentFileError, match=r"RandomNormal|act otherwise than the module"):
-        save_agent(tmp_path / "a.onnx", Noisy(nn.Tanh()), CONFIG)
 
 
 @pytest.mark.parametrize("change", [{"training_steps": 500_000}, {"learned_from": "reward"}, {"algorithm": "other"}])

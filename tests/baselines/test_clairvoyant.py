@@ -132,6 +132,7 @@ def test_the_clairvoyant_optimum_within_tight_limits_is_a_general_optimisers():
     assert (found.u[:, 0, 0] - nominal[0]) / MM_PER_MIN == pytest.approx(peer.x[::2], abs=1e-5)
 
 
+@pytest.mark.slow
 def test_slow_narrow_and_stepping_drives_are_respected_and_followed():
     pull = {"pull_window": 0.05 * MM_PER_MIN, "pull_slew": 0.06 * MM_PER_MIN / MINUTE}
     actuators = Actuators(**pull, heater_slew=0.2 * KILO / MINUTE, heater_step=0.1 * KILO)

@@ -6,16 +6,8 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from cz_gym.baselines.crystal import (
-    SIZES,
-    START_SD,
-    STATES,
-    CrystalNoise,
-    CrystalWeights,
-    design,
-    filtered,
-    variances,
-)
+from cz_gym.baselines import crystal as along
+from cz_gym.baselines.crystal import SIZES, START_SD, STATES, CrystalNoise, CrystalWeights, design, filtered
 from cz_gym.baselines.tuned import by_scenario, with_values
 from cz_gym.baselines.tuned_controllers import CRYSTALS
 from cz_gym.config import make_config
@@ -95,7 +87,7 @@ def test_the_filter_s_covariance_settles_on_the_riccati_equation_s(row, read):
     """With ring, with edge, blind: what is not read has no gain; the observer is stable; scaled as the design is."""
     at = design(make_config(process=CRYSTAL).parameters, HURLE, 5.0, 0.5, CrystalNoise(), CrystalWeights())
     A, C, Q = at.A[row], at.C[row], at.Q[row]
-    noise, reads = variances(CrystalNoise()), np.isin(np.arange(4), read)[None] * 1.0
+    noise, reads = along.variances(CrystalNoise()), np.isin(np.arange(4), read)[None] * 1.0
     P = np.diag(START_SD**2)[None]
     for _ in range(6000):
         before = A @ P @ A.T + Q

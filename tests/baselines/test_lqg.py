@@ -8,20 +8,10 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
 from cz_gym import SCENARIOS, CzVectorEnv, make_puller
+from cz_gym.baselines import lqg
 from cz_gym.baselines.analysis import close, linear_form
 from cz_gym.baselines.clairvoyant import episodes_of, pullers_of
-from cz_gym.baselines.lqg import (
-    CHARGED_PULL,
-    LQG,
-    LQGDesign,
-    PrivilegedLQG,
-    look_ahead,
-    privileged,
-    quadratic_cost,
-    regulator,
-    samples_ahead,
-    solve,
-)
+from cz_gym.baselines.lqg import CHARGED_PULL, LQG, LQGDesign, PrivilegedLQG, look_ahead, privileged, regulator, solve
 from cz_gym.baselines.lqg_estimator import Hypotheses, multiple_model_filter
 from cz_gym.baselines.lqg_filter import DRIFT, FAST, HEATER, PLANT, SLOW, STATES, NoiseModel, RingModel, plant_model
 from cz_gym.baselines.tuned_controllers import FACTORS, FAMILY, adaptive
@@ -38,7 +28,7 @@ from cz_gym.spaces import decode
 from cz_gym.support.errors import map_arrays
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 from cz_gym.tools.registry import CONTROLLERS, find_controller, make_controller
-from tests.observed import PLAIN, Watched, measured, observations
+from tests.observed import PLAIN, Watched, measured
 from tests.samples import NOMINAL_LQG
 
 PULLER = make_puller(lam=0.5)
@@ -83,7 +73,7 @@ def brute_force_first_move(model, weights, dt, z, steps, reference_steps, drift_
     A = np.block([[model.A, model.B], [np.zeros((2, n)), np.eye(2)]])
     B = np.vstack([model.B, np.eye(2)])
     free, forced, radius = z.copy(), np.zeros((n + 2, 2 * steps)), 0.0
-    Q, _, R = quadratic_cost(weights, dt)
+    Q, _, R = lqg.quadratic_cost(weights, dt)
     pull, moves = Q[PLANT, PLANT], np.diag(R) - np.array([Q[PLANT, PLANT], 0.0])
     rows, targets = [], []
     for k in range(steps):
@@ -133,7 +123,7 @@ def test_the_plan_is_the_recipe_five_minutes_ahead(dt):
         return 1e-3 * quintic(np.clip((t - 400.0) / 1200.0, 0.0, 1.0))
 
     zeros = np.zeros(1)
-    samples = samples_ahead(dt)
+    samples = lqg.samples_ahead(dt)
     plan = np.zeros((1, 2, samples + 1))
     for k in range(round(900.0 / dt)):
         shown = [np.array([recipe(k * dt + ahead)]) for ahead in (0.0, 60.0, 300.0)]
@@ -399,9 +389,3 @@ def test_the_privileged_lqg_of_a_nominal_puller_is_the_lqg(error_pull):
     design, config = LQGDesign(lam=1.0, error_pull=error_pull), make_config("only-interface", horizon=900.0, **PLAIN)
     privileged, plain = (rollout(kind(design=design), config, [0, 1, 2]) for kind in (PrivilegedLQG, LQG))
     np.testing.assert_allclose(privileged.signals.v_p, plain.signals.v_p, rtol=1e-5)
-
-
-def test_other_slots_than_the_known_ones_are_refused():
-    privileged = PrivilegedLQG().for_episodes(make_config("randomized", **PLAIN), [1, 2])
-    with pytest.raises(ValueError, match="2 pullers are known, got 3 slots"):
-        privileged.predict(next(observations()))

@@ -23,7 +23,6 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.physics.parameters import Parameters
 from cz_gym.process import PULL_SCALE
 from cz_gym.spaces import HEATER_RANGE, MEASURED
-from cz_gym.support.errors import CzError
 from cz_gym.support.units import MM, MM_PER_MIN
 from tests.observed import PLAIN, measured, pulls
 
@@ -207,8 +206,3 @@ def test_every_form_of_a_pid_converts_back_to_the_same_controller(pid):
     parallel = P + I / s + D * s / (a * T_d * s + 1.0)
     assert compact == pytest.approx(series, rel=1e-9)
     assert parallel == pytest.approx(series, rel=1e-9)
-
-
-def test_a_pid_with_complex_zeros_has_no_series_form():
-    with pytest.raises(CzError, match="complex zeros"):
-        StandardPID(1.0, 100.0, 100.0, 0.1).series()

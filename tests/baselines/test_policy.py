@@ -3,7 +3,7 @@
 import math
 import pickle
 from dataclasses import replace
-from functools import reduce
+from functools import cache, reduce
 from operator import or_
 
 import numpy as np
@@ -14,8 +14,11 @@ from hypothesis import strategies as st
 
 from cz_gym import SCENARIOS, CzVectorEnv, Parameters
 from cz_gym.baselines import CompensatedPID, Compensator, SeriesPID
+from cz_gym.baselines.analysis import design_compensator
+from cz_gym.baselines.lqg import PrivilegedLQG
 from cz_gym.baselines.lqg_filter import NoiseModel, RingModel
-from cz_gym.baselines.pid import FilteredPID, TemperatureLoop
+from cz_gym.baselines.margins import margin_limits
+from cz_gym.baselines.pid import FilteredPID, StandardPID, TemperatureLoop
 from cz_gym.baselines.policy import Policy
 from cz_gym.body.process import BODY
 from cz_gym.config import make_config
@@ -28,7 +31,8 @@ from cz_gym.support.errors import CzError, map_arrays
 from cz_gym.support.units import KILO, MM_PER_MIN
 from cz_gym.tools.export.controllers import make_block
 from cz_gym.tools.registry import CONTROLLERS, CRYSTAL_CONTROLLERS, KNOWN, find_controller, make_controller
-from tests.observed import PLAIN, actions_of, measured
+from studies.paper.experiments import MODEL_I, MODEL_II
+from tests.observed import PLAIN, actions_of, measured, observations
 
 ALL = [(each, task) for task in (BODY, CRYSTAL) for each in KNOWN[task.name] if not each.slow]
 SEEING = [(each, task) for each, task in ALL if not each.bound or each.observation == "measured"]
@@ -182,24 +186,36 @@ def test_a_ring_that_is_not_valid_is_not_read(name, garbage):
     np.testing.assert_allclose(actions_of(policy, rows), actions_of(policy, held), rtol=1e-5, atol=1e-9)
 
 
+LIMITS = ("", "2", "2,30,2,1", "a,b,c", "0.5,30,2", "2,30,1", "nan,30,2")
+
+
+def other_slots():
+    PrivilegedLQG().for_episodes(make_config("randomized", **PLAIN), [1, 2]).predict(next(observations()))
+
+
 @pytest.mark.parametrize(
-    ("kind", "wrong"),
+    ("call", "message"),
     [
-        (SeriesPID, {"K_p": -0.01}),
-        (SeriesPID, {"T_i": 0.0}),
-        (SeriesPID, {"N": math.nan}),
-        (Compensator, {"fast": -1e-3}),
-        (CompensatedPID, {"control_interval": 0.0}),
-        (FilteredPID, {"T_f": -1.0}),
-        (TemperatureLoop, {"T_i": 0.0}),
-        (NoiseModel, {"slow_tau": 0.0}),
-        (RingModel, {"latency": -5.0}),
+        (lambda: SeriesPID(K_p=-0.01), "K_p must be"),
+        (lambda: SeriesPID(T_i=0.0), "T_i must be"),
+        (lambda: SeriesPID(N=math.nan), "N must be"),
+        (lambda: Compensator(fast=-1e-3), "fast must be"),
+        (lambda: CompensatedPID(control_interval=0.0), "control_interval must be"),
+        (lambda: FilteredPID(T_f=-1.0), "T_f must be"),
+        (lambda: TemperatureLoop(T_i=0.0), "T_i must be"),
+        (lambda: NoiseModel(slow_tau=0.0), "slow_tau must be"),
+        (lambda: RingModel(latency=-5.0), "latency must be"),
+        (lambda: StandardPID(1.0, 100.0, 100.0, 0.1).series(), "complex zeros"),
+        (lambda: design_compensator(MODEL_II), "two stable"),
+        (lambda: design_compensator(MODEL_I, -MODEL_I.poles[1]), "two stable"),
+        (lambda: design_compensator(MODEL_I, 0.0), "cut"),
+        (other_slots, "2 pullers are known, got 3 slots"),
+        *((lambda text=text: margin_limits(text), "--margins") for text in LIMITS),
     ],
 )
-def test_impossible_settings_are_refused_at_once(kind, wrong):
-    (name,) = wrong
-    with pytest.raises(CzError, match=f"{name} must be"):
-        kind(**wrong)
+def test_what_no_controller_can_be_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
 
 
 # Readings of the drives that err
@@ -212,16 +228,21 @@ ERRING = {
 ERRING["all"] = reduce(or_, ERRING.values())
 
 
+@cache
+def read_with(name, errors):
+    """Metrics of a controller that was made for exact readings."""
+    exact, erring = (
+        make_config(replace(SCENARIOS["puller"], readings=DriveReadings(**values)), horizon=3600.0, **PLAIN)
+        for values in ({}, ERRING.get(errors, {}))
+    )
+    return metrics(rollout(make_controller(name, exact), erring, range(6)))
+
+
 @pytest.mark.parametrize("errors", ERRING)
 @pytest.mark.parametrize("name", ["lqg", "lqg-at-0.02", "paper-tuned"])
 def test_erring_readings_of_the_drives_lose_no_crystal(name, errors):
     """A power that read half a percent wrong lost every crystal of the LQGs when moves began at readings."""
-    exact, erring = (
-        make_config(replace(SCENARIOS["puller"], readings=DriveReadings(**values)), horizon=3600.0, **PLAIN)
-        for values in ({}, ERRING[errors])
-    )
-    policy = make_controller(name, exact)
-    usual, found = (metrics(rollout(policy, config, range(6))) for config in (exact, erring))
+    usual, found = read_with(name, "none"), read_with(name, errors)
     assert not found.failure_rate.any()
     assert found.rmse_observable_mm.mean() <= 1.2 * usual.rmse_observable_mm.mean()
 

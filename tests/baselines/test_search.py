@@ -7,32 +7,13 @@ from functools import partial
 import numpy as np
 import pytest
 
+from cz_gym.baselines import tuned_controllers as records
 from cz_gym.baselines.lqg import LQGDesign
 from cz_gym.baselines.margins import MarginLimits, worst_margins
 from cz_gym.baselines.pid import FilteredPID
 from cz_gym.baselines.search import Search
-from cz_gym.baselines.tuned import (
-    TUNED,
-    Objective,
-    Parameter,
-    Scores,
-    by_scenario,
-    file_name,
-    measure,
-    value_at,
-)
-from cz_gym.baselines.tuned_controllers import (
-    ACTIVITIES,
-    BEST_RETURN,
-    CRYSTALS,
-    FAMILY,
-    LQG_PARAMETERS,
-    LQGS,
-    PIDS,
-    CrystalScores,
-    lqg_objective,
-    price,
-)
+from cz_gym.baselines.tuned import TUNED, Objective, Parameter, Scores, by_scenario, file_name, measure, value_at
+from cz_gym.baselines.tuned_controllers import ACTIVITIES, BEST_RETURN, CRYSTALS, LQG_PARAMETERS, LQGS, PIDS, price
 from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
@@ -226,7 +207,7 @@ def test_every_parameter_sets_what_it_names_and_a_search_begins_with_the_setting
 # LQGs
 
 START = LQGDesign()
-GOAL = replace(lqg_objective(0.07, 0.02, True, ("hard", "puller")), start=START, parameters=LQG_PARAMETERS)
+GOAL = replace(records.lqg_objective(0.07, 0.02, True, ("hard", "puller")), start=START, parameters=LQG_PARAMETERS)
 
 
 def logarithms(design):
@@ -300,14 +281,14 @@ def test_shipped_settings_are_those_a_search_chose(tuned, scenario):
         assert not found["chosen"]["figures"]["failure_rate"]
     if tuned in CRYSTALS:
         assert found["history"][0][0] == list(search.first)
-        score = search.objective.score(CrystalScores(**found["chosen"]["figures"]), None)
+        score = search.objective.score(records.CrystalScores(**found["chosen"]["figures"]), None)
         assert found["chosen"]["score"] == pytest.approx(score)
 
 
 @pytest.mark.parametrize("scenario", [each.name for each in TUNED])
 def test_the_family_has_less_error_the_more_it_may_move(scenario):
     """But for the most active member on puller, where the drive limits the steps."""
-    found = [kept(each, scenario)["chosen"]["figures"] for each in FAMILY[1:]]
+    found = [kept(each, scenario)["chosen"]["figures"] for each in records.FAMILY[1:]]
     errors = [one["rmse_mm"] for one in found]
     assert errors[:-1] == sorted(errors[:-1], reverse=True)
     assert errors[-1] < errors[-2] or scenario == "puller"

@@ -13,26 +13,7 @@ from stable_baselines3.common.env_checker import check_env as check_with_sb3
 from cz_gym import CzEnv, Parameters, make_puller
 from cz_gym.camera import view as rays
 from cz_gym.camera.image import RingDetector, picture, radiance, sight, wall_edge
-from cz_gym.camera.view import (
-    COLUMNS,
-    FLAT,
-    IMAGE,
-    MELT,
-    ROWS,
-    Camera,
-    Hit,
-    Ray,
-    Scene,
-    camera_for,
-    check_camera,
-    first_hit,
-    make_scene,
-    make_view,
-    mirror,
-    profile_at,
-    project,
-    slope_at,
-)
+from cz_gym.camera.view import FLAT, IMAGE, MELT, Camera, Ray, first_hit, make_scene, make_view, profile_at, slope_at
 from cz_gym.config import make_config
 from cz_gym.episodes.draw import stream_number
 from cz_gym.episodes.scenario import Scenario, Sensor
@@ -44,7 +25,7 @@ VIEW = make_view(Camera())
 
 
 def scene_at(r_c=PULLER.r_0, h_c=PULLER.h_0):
-    return Scene(*map(float, make_scene(r_c, h_c, PULLER)))
+    return rays.Scene(*map(float, make_scene(r_c, h_c, PULLER)))
 
 
 def height_of_melt(r, scene):
@@ -101,9 +82,9 @@ def test_rays_are_mirrored_by_the_law_of_reflection():
     for _ in range(50):
         q, angle = rng.uniform(scene.q_c, FLAT), rng.uniform(-0.6, 0.6)
         r, z, _, _ = profile_at(q, scene)
-        hit = Hit(MELT, r * math.cos(angle), r * math.sin(angle), z, q)
+        hit = rays.Hit(MELT, r * math.cos(angle), r * math.sin(angle), z, q)
         ray = Ray(0.4, 0.0, 0.9, hit.x - 0.4, hit.y, hit.z - 0.9)
-        out = mirror(ray, hit)
+        out = rays.mirror(ray, hit)
         sine, cosine = slope_at(q)
         n = np.array([sine * math.cos(angle), sine * math.sin(angle), cosine])
         before, after = np.array(ray[3:]), np.array(out[3:])
@@ -139,7 +120,7 @@ def test_the_rings_edge_halves_the_angle_between_camera_and_walls_end(tilt, wall
     view = make_view(Camera(tilt=tilt, wall_height=wall_height))
     scene = scene_at()
     edge = wall_edge(scene, view)
-    row = float(project(edge.r, 0.0, edge.z, view).row)
+    row = float(rays.project(edge.r, 0.0, edge.z, view).row)
 
     def excess(row):
         return radiance(sight(row, 80.0, view), scene, view) - 0.5
@@ -243,7 +224,7 @@ def test_shot_noise_is_that_of_its_frames_stream():
     for k in range(2):
         numbers = np.random.Generator(np.random.PCG64(np.random.SeedSequence(key, spawn_key=(8 + k,))))
         # Each pixel of the left half draws, then its mirror image.
-        left, right = np.moveaxis(numbers.standard_normal((ROWS, COLUMNS // 2, 2)), 2, 0)
+        left, right = np.moveaxis(numbers.standard_normal((rays.ROWS, rays.COLUMNS // 2, 2)), 2, 0)
         noise = np.hstack([left, right[:, ::-1]]) * np.sqrt(still / VIEW.electrons)
         assert np.abs(image[..., 0] - np.minimum(still + noise, 255.0)).max() < 1.1
         image, *_ = env.step(np.zeros(2, np.float32))
@@ -273,7 +254,7 @@ def test_an_image_without_a_ring_reads_as_nan(detector):
     ("call", "says"),
     [
         *(
-            (lambda change=change: check_camera(Camera()._replace(**change), Parameters()), says)
+            (lambda change=change: rays.check_camera(Camera()._replace(**change), Parameters()), says)
             for change, says in (
                 ({"tilt": 1.6}, "tilt"),
                 ({"distance": 0.1}, "above the heat shield"),
@@ -301,7 +282,7 @@ def test_a_camera_changes_the_hash():
 
 def test_images_and_detector_follow_another_puller():
     parameters = Parameters(r_0=0.06, R_cr=0.2)
-    puller, view = make_puller(parameters), make_view(camera_for(parameters))
+    puller, view = make_puller(parameters), make_view(rays.camera_for(parameters))
     assert abs(RingDetector(view, puller).read(picture(0.061, puller.h_0, puller, view)).radius - 0.061) < 1e-4
     image, _ = CzEnv("nominal", observation="camera", parameters=parameters).reset(seed=0)
     np.testing.assert_array_equal(image, picture(puller.r_0, puller.h_0, puller, view))

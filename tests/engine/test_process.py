@@ -265,6 +265,7 @@ def _still(self, observation, state=None, episode_start=None, deterministic=True
     return np.zeros((len(observation), 2), np.float32), None
 
 
+@pytest.mark.slow  # compiles for half a minute, whatever was kept: the process is the test's own
 def test_its_step_has_derivatives():
     """Of state, inputs, what is carried on and cost, against differences."""
     config = make_config("nominal", action="direct", process=TANK)

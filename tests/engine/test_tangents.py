@@ -52,6 +52,8 @@ LATE = replace(RANDOMIZED, sensor=replace(RANDOMIZED.sensor, latency=1.0))
 
 
 WHOLE = {"process": CRYSTAL, "stage": {"crown": 2, "body": 1, "tail": 1}}
+ALONG = (("randomized", "rate", 5.0, 40), ("sensor-fault", "rate", 5.0, 40), ("randomized", "smooth", 3.0, 42))
+"""Whole crystals, whose derivatives take two minutes to compile."""
 
 
 @pytest.mark.parametrize(
@@ -60,8 +62,7 @@ WHOLE = {"process": CRYSTAL, "stage": {"crown": 2, "body": 1, "tail": 1}}
         *((scenario, action, 5.0, 40, {}) for scenario in ("randomized", "sensor-fault") for action in ACTIONS),
         *(("randomized", "smooth", interval, 42, {}) for interval in (2.0, 3.0)),
         *((LATE, "smooth", 2.0, steps, {}) for steps in (42, 43)),
-        *((scenario, "rate", 5.0, 40, WHOLE) for scenario in ("randomized", "sensor-fault")),
-        ("randomized", "smooth", 3.0, 42, WHOLE),
+        *(pytest.param(*along, WHOLE, marks=pytest.mark.slow) for along in ALONG),
     ],
 )
 def test_derivatives_are_those_of_the_steps(scenario, action, interval, steps, what):
@@ -186,6 +187,7 @@ def test_the_chain_rule_over_rk4_is_exact():
         x = rk4(x, u, d, puller, 5.0, hurle_slope)
 
 
+@pytest.mark.slow
 def test_the_end_of_the_tail_has_derivatives():
     """Where the crystal is hundreds of its fin's lengths long; and a length that is reached is no loss."""
     batch = DifferentiableBatch(make_config("nominal", process=CRYSTAL, stage=1.24, **PLAIN), 2)

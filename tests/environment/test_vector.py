@@ -182,12 +182,6 @@ def test_what_a_batch_cannot_mean_is_refused(call, error, says):
     CzVectorEnv.__new__(CzVectorEnv).close_extras()  # Gymnasium up to 1.1 does so when one is forgotten
 
 
-def test_seeds_are_one_a_slot_and_remembered():
-    env = CzVectorEnv(2)
-    env.reset(seed=[4, 5])
-    assert env.np_random_seed == (4, 5)
-
-
 def test_a_single_seed_s_crystals_are_none_of_any_split_s():
     """Slots of a training seed near the first validation seed meet no crystal of validation or test."""
     batch, seed = CzVectorEnv(3), VALIDATION_SEEDS[0] - 1

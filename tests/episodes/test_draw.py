@@ -11,18 +11,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from cz_gym import SCENARIOS, Parameters, Scenario, make_puller
-from cz_gym.episodes.draw import (
-    AVERAGING_ERROR,
-    FREEZES,
-    Episode,
-    Factors,
-    Stream,
-    episode_from_key,
-    factors_from_key,
-    new_series,
-    randomised,
-    stream_number,
-)
+from cz_gym.episodes import draw as draws
+from cz_gym.episodes.draw import AVERAGING_ERROR, FREEZES, Episode, Factors, Stream, factors_from_key, new_series
 from cz_gym.episodes.rng import WORDS, next_word, normal, seed_stream, two_normals, uniform
 from cz_gym.episodes.scenario import Actuators, Faults, Interface, Reference, Sensor, TemperatureRamp, Told, Variation
 from cz_gym.jit import kernel
@@ -38,7 +28,7 @@ def draw(scenario, key, grid=50, samples=50):
     series = new_series(grid, samples)
     for array in series:
         array[:] = 7.0
-    return episode_from_key(found, key, series), series
+    return draws.episode_from_key(found, key, series), series
 
 
 def keys(n):
@@ -98,7 +88,7 @@ def test_an_averaged_ring_has_the_mean_of_its_frames(revolutions):
     averaged = dataclasses.replace(SCENARIOS["puller"], sensor=sensor)
     for key in keys(5):
         frame, mean = draw("puller-frames", key)[0], draw(averaged, key)[0]
-        stream = np.random.PCG64(np.random.SeedSequence(key, spawn_key=(stream_number(Stream.TOLD),)))
+        stream = np.random.PCG64(np.random.SeedSequence(key, spawn_key=(draws.stream_number(Stream.TOLD),)))
         error = np.random.Generator(stream).standard_normal(3)[2]
         window = revolutions * (1.0 + AVERAGING_ERROR * error) * 2.0 * math.pi / frame.ripple_omega
         taken = np.array([0.0, 5.0, 1234.0])
@@ -261,7 +251,7 @@ def test_what_happens_by_chance_has_its_probability_and_its_distribution():
 
 def test_drawn_factors_scale_the_parameters_of_the_puller():
     q, factors = Parameters(), Factors(0.3, 1.02, 1.1, 0.9, 1.05, 0.95, 1.08)
-    p, nominal = make_puller(randomised(q, factors), factors.lam), make_puller(q)
+    p, nominal = make_puller(draws.randomised(q, factors), factors.lam), make_puller(q)
     assert p.a / nominal.a == pytest.approx(1.02)
     assert (p.k_l, p.kappa_12, p.G_1a, p.G_2b) == pytest.approx((62 * 1.1, 2.8e-8 * 0.9, 30 * 1.05, 200 * 0.95))
     assert p.emission / nominal.emission == pytest.approx(1.08)

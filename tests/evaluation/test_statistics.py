@@ -5,16 +5,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from cz_gym.evaluation.statistics import (
-    Resamples,
-    cvar,
-    differences,
-    frontier,
-    intervals,
-    means,
-    probability_of_improvement,
-    ratios,
-)
+from cz_gym.evaluation import statistics
+from cz_gym.evaluation.statistics import Resamples, cvar, differences, frontier, means, probability_of_improvement
 
 
 def single(values):
@@ -152,7 +144,9 @@ def test_ratios_are_taken_at_each_controllers_own_activity():
     """Between the members of a family that is a power law, the curve is that law."""
     points = {name: (a, power_law(a)) for name, a in zip(FAMILY[:2], (0.005, 0.02), strict=True)}
     points |= {"agent": (0.01, 0.2), "quieter": (0.001, 0.4), "busier": (0.1, power_law(0.02) / 2.0)}
-    assert ratios(points, FAMILY) == pytest.approx({FAMILY[0]: 1.0, FAMILY[1]: 1.0, "agent": 2.0, "busier": 0.5})
+    assert statistics.ratios(points, FAMILY) == pytest.approx(
+        {FAMILY[0]: 1.0, FAMILY[1]: 1.0, "agent": 2.0, "busier": 0.5}
+    )
 
 
 def drawn(activity, rmse, seeds=1, spread=0.1):
@@ -167,14 +161,14 @@ def test_a_ratios_interval_holds_it_and_shrinks_with_the_spread():
     widths = []
     for spread in (0.2, 0.02):
         episodes = {**MEMBERS, "agent": drawn(0.01, 0.12, seeds=3, spread=spread)}
-        found = intervals(episodes, FAMILY, Resamples.draw(60, 200))
+        found = statistics.intervals(episodes, FAMILY, Resamples.draw(60, 200))
         means = {name: tuple(values.mean(axis=(0, 1))) for name, values in episodes.items()}
         low, high = found["agent"]
-        assert low < ratios(means, FAMILY)["agent"] < high
+        assert low < statistics.ratios(means, FAMILY)["agent"] < high
         assert found[FAMILY[2]] == pytest.approx((1.0, 1.0))
         widths.append(high - low)
     assert widths[1] < widths[0]
 
 
 def test_an_agent_quieter_than_the_family_has_no_interval():
-    assert "agent" not in intervals({**MEMBERS, "agent": drawn(0.001, 0.5)}, FAMILY, Resamples.draw(60, 50))
+    assert "agent" not in statistics.intervals({**MEMBERS, "agent": drawn(0.001, 0.5)}, FAMILY, Resamples.draw(60, 50))

@@ -13,15 +13,8 @@ from scipy.special import k0e, k1e
 
 from cz_gym import Parameters, make_puller
 from cz_gym.body.process import radius_model
-from cz_gym.physics.meniscus import (
-    HURLE,
-    hurle_height,
-    hurle_ring_offset,
-    hurle_slope,
-    profile,
-    profile_scale,
-    ring_point,
-)
+from cz_gym.physics import meniscus
+from cz_gym.physics.meniscus import HURLE, hurle_height, hurle_ring_offset, hurle_slope, profile, ring_point
 from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 
@@ -53,7 +46,7 @@ def slope_of_profile(z, M):
 def test_profile_leaves_the_crystal_at_theta(points):
     r_c, h_c = points
     sine, cosine = hurle_slope(r_c, h_c, PULLER)
-    M = profile_scale(r_c, h_c, cosine, PULLER.a)
+    M = meniscus.profile_scale(r_c, h_c, cosine, PULLER.a)
     np.testing.assert_allclose(slope_of_profile(h_c, M), -sine / cosine, rtol=1e-9, atol=1e-12)
 
 

@@ -15,23 +15,10 @@ from cz_gym.crystal.process import APART, CRYSTAL, lengths, nominal_recipe
 from cz_gym.crystal.recipe import RecipeRow
 from cz_gym.episodes.draw import Episode, Factors, episode_from_key, new_series, randomised
 from cz_gym.episodes.scenarios import TRACED_SLOPE
+from cz_gym.physics import plant as schedules
 from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.parameters import MACHINE, SIZES, check_parameters
-from cz_gym.physics.plant import (
-    HEIGHT_MIN,
-    Disturbance,
-    State,
-    bias_offset,
-    disturbance,
-    drift,
-    hidden_load,
-    pyrometer_drift,
-    quintic,
-    recipe,
-    reference,
-    ripple,
-    rk4,
-)
+from cz_gym.physics.plant import HEIGHT_MIN, Disturbance, State, disturbance, drift, quintic, recipe, reference, rk4
 from cz_gym.process import Inputs
 from cz_gym.support.units import MM
 from tests.conftest import ROOT
@@ -68,9 +55,9 @@ STEPS = Episode(
         (reference, "reference-b", [0.0, 600.0, 1500.0, 2400.0, 10200.0], [0.0, 0.0, -0.25e-3, -0.5e-3, -0.5e-3]),
         (recipe, STEPS, [750.0], [1.0 - 3.0 + 1.25]),
         (drift, STEPS, [2000.0], [-4.0 + 0.1 / 60 * 2000]),
-        (bias_offset, STEPS, [0.0, 1500.0, 9000.0], [1e-4, 0.0, -1e-4]),
-        (ripple, STEPS, [0.0, 3.0, 6.0], [1e-4, -1e-4, 1e-4]),
-        (pyrometer_drift, STEPS, [0.0, THREE_HOURS / 2, THREE_HOURS], [0.0, 1.0, 2.0]),
+        (schedules.bias_offset, STEPS, [0.0, 1500.0, 9000.0], [1e-4, 0.0, -1e-4]),
+        (schedules.ripple, STEPS, [0.0, 3.0, 6.0], [1e-4, -1e-4, 1e-4]),
+        (schedules.pyrometer_drift, STEPS, [0.0, THREE_HOURS / 2, THREE_HOURS], [0.0, 1.0, 2.0]),
     ],
 )
 def test_schedules_have_their_values_at_times(schedule, e, times, expected):
@@ -84,7 +71,7 @@ def test_disturbance_hides_the_drift_and_melts_the_charge_away():
     p = make_puller()
     e = Episode(drift_duration=100.0, drift_amount=3.0, melt_loss=0.1)
     d = disturbance(THREE_HOURS / 2, 0.7, e, p)
-    assert d.Q_d == pytest.approx(hidden_load(3.0, p))
+    assert d.Q_d == pytest.approx(schedules.hidden_load(3.0, p))
     assert d.dT_i == 0.7
     assert d.melt == pytest.approx(0.95)
     assert disturbance(2 * THREE_HOURS, 0.0, e, p).melt == pytest.approx(0.9)

@@ -1,7 +1,6 @@
 """Installation: one package with four dependencies, by every way of installing it."""
 
 import importlib
-import json
 import os
 import re
 import shutil
@@ -168,20 +167,6 @@ def test_actions_are_pinned_by_hash():
     uses = re.findall(r"uses: (\S+)", "".join(file.read_text() for file in (ROOT / ".github").rglob("*.yml")))
     assert len(uses) > 5
     assert all(re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", each) for each in uses)
-
-
-def test_the_dev_container_installs_what_there_is():
-    """No engine runs it here: what it names exists, and its Python is the one that versions are locked for."""
-    found = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text())
-    assert found["image"].endswith(f"/python:{SETTINGS['tool']['mypy']['python_version']}")
-    command, target = found["postCreateCommand"].split()
-    makefile = (ROOT / "Makefile").read_text()
-    assert command == "make"
-    assert re.search(rf"^{target}:", makefile, re.MULTILINE)
-    folder = re.search(r"^VENV := (\S+)", makefile, re.MULTILINE)[1]
-    assert found["customizations"]["vscode"]["settings"] == {"python.defaultInterpreterPath": f"{folder}/bin/python"}
-    workflow = (ROOT / ".github" / "workflows" / "tests.yml").read_text()
-    assert all(f"{name}: {value}\n" in workflow for name, value in found["containerEnv"].items())
 
 
 def test_environment_and_baselines_need_neither_torch_nor_plots():

@@ -13,18 +13,8 @@ from cz_gym.engine.tangents import DifferentiableBatch
 from cz_gym.env import CzEnv
 from cz_gym.episodes.scenarios import ALL, HARD, PULLER, RANDOMIZED, adapt_scenario
 from cz_gym.physics.parameters import MACHINE, CrystalRecipe, Parameters
-from cz_gym.puller.file import (
-    DEFAULT,
-    FOLDER,
-    PullerFile,
-    chosen_puller,
-    doubts,
-    find_puller,
-    read_puller,
-    to_toml,
-    value_of,
-    write_puller,
-)
+from cz_gym.puller import file as files
+from cz_gym.puller.file import DEFAULT, FOLDER, PullerFile, chosen_puller, doubts, find_puller, read_puller, to_toml
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
 from cz_gym.tools import puller as describe
@@ -48,7 +38,7 @@ def pullers(draw):
         if symbol in AS_THEY_ARE:
             continue
         parts = (part for part, kind in ((parameters, Parameters), (recipe, CrystalRecipe)) if symbol in kind._fields)
-        middle, part = value_of(DEFAULT, quantity), next(parts, own)
+        middle, part = files.value_of(DEFAULT, quantity), next(parts, own)
         low, high = (max(quantity.low, -100.0) * quantity.size, min(quantity.high, 100.0) * quantity.size)
         if part is not own:
             low, high = 0.9 * middle, 1.1 * middle
@@ -65,7 +55,7 @@ def pullers(draw):
 @example(puller=PullerFile("ends", camera_noise=(5e-324, 1e-305), pyrometer_drift=(-100.0, 100.0), heater_step=0.3))
 def test_what_is_written_is_read_again_bit_for_bit(puller, tmp_path_factory):
     path = tmp_path_factory.mktemp("puller") / "mine.toml"
-    write_puller(puller, path)
+    files.write_puller(puller, path)
     again = read_puller(path)
     assert (again, again.hash, to_toml(again)) == (puller, puller.hash, to_toml(puller))
 

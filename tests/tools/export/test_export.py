@@ -51,6 +51,12 @@ def block_of(name, scenario="puller"):
     return make_block(name, config_of(scenario))
 
 
+@cache
+def in_language(kind, name):
+    """A block in a language of ``LANGUAGES``, compiled once."""
+    return kind(block_of(name))
+
+
 class StBlock:
     """A block's structured text, for one plant, in the tests' interpreter."""
 
@@ -88,7 +94,7 @@ class Plant:
 
     def __init__(self, name="paper-tuned", runner=lambda block: block, **changed):
         self.block, self.changed = block_of(name), {"ring_still_s": 1e9, "takeover_s": 60.0} | changed
-        self.runner = runner(self.block)
+        self.runner = in_language(runner, name)
         self.memory = self.runner.start(1)
         self.time = 0.0
 
@@ -209,7 +215,7 @@ def test_the_test_vector_is_what_every_language_computes(name, runner):
     """Late calls, a gap, bad readings and the fallback among them."""
     block = block_of(name)
     head, *rows = (line.split(",") for line in vector_of(block).splitlines())
-    other, alarms = runner(block), 0
+    other, alarms = in_language(runner, name), 0
     memory = other.start(1)
     for row in rows:
         given = dict(zip(head, map(float, row), strict=True))
@@ -269,15 +275,15 @@ def test_faults_lose_no_crystal(fault):
     Half an hour without a ring loses some of this unstable plant's crystals under every block, the fallback's too.
     """
     block = block_of("paper-tuned")
-    row = grow(block, fault, 2, CompiledBlock(block), 7200.0)
+    row = grow(block, fault, 2, in_language(CompiledBlock, "paper-tuned"), 7200.0)
     assert row.lost == row.helpless
 
 
 @needs_compiler
 @pytest.mark.parametrize("fault", ["heater reads 1.03", "drives read wrong, draw 1", "ring steps by -2 mm"])
 def test_readings_that_err_cost_no_radius(fault):
-    block = block_of("paper-tuned")
-    exact, row = (grow(block, each, 3, CompiledBlock(block), 5400.0) for each in ("none", fault))
+    block, compiled = block_of("paper-tuned"), in_language(CompiledBlock, "paper-tuned")
+    exact, row = (grow(block, each, 3, compiled, 5400.0) for each in ("none", fault))
     assert row.lost == 0
     assert row.rmse < 1.2 * exact.rmse
 
