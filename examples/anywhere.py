@@ -133,49 +133,58 @@ def cleanrl(budget: Budget, seed: int = 0) -> nn.Module:
 
 
 def skrl(budget: Budget, seed: int = 0) -> nn.Module:
-    """Models with ``compute(inputs, role)`` and a preprocessor that normalises states: both go into the module."""
+    """Its agent, memory and trainer: the scaler of observations and the policy's network go into the module."""
+    from gymnasium.wrappers.vector import NormalizeReward
+    from skrl.agents.torch.ppo import PPO
+    from skrl.envs.wrappers.torch import wrap_env
+    from skrl.memories.torch import RandomMemory
+    from skrl.models.torch import DeterministicMixin, GaussianMixin, Model
+    from skrl.resources.preprocessors.torch import RunningStandardScaler
+    from skrl.trainers.torch import SequentialTrainer
+    from skrl.utils import set_seed
 
-    class Scaler(nn.Module):
-        """Running mean and variance, frozen in the file."""
+    class Policy(GaussianMixin, Model):  # type: ignore[misc]
+        def __init__(self, **spaces: Any) -> None:
+            Model.__init__(self, **spaces)
+            GaussianMixin.__init__(self)
+            self.net, self.log_sd = mlp(2), nn.Parameter(torch.full((2,), -0.7))
 
-        mean: torch.Tensor
-        variance: torch.Tensor
-        count: torch.Tensor
+        def compute(self, inputs: dict[str, torch.Tensor], role: str) -> Any:
+            return self.net(inputs["observations"]), {"log_std": self.log_sd}
 
-        def __init__(self) -> None:
-            super().__init__()
-            for name, start in (("mean", torch.zeros(CHANNELS)), ("variance", torch.ones(CHANNELS))):
-                self.register_buffer(name, start)
-            self.register_buffer("count", torch.ones(()))
+    class Value(DeterministicMixin, Model):  # type: ignore[misc]
+        def __init__(self, **spaces: Any) -> None:
+            Model.__init__(self, **spaces)
+            DeterministicMixin.__init__(self)
+            self.net = mlp(1)
 
-        def watch(self, x: torch.Tensor) -> None:
-            share = len(x) / (self.count + len(x))
-            apart = x.mean(0) - self.mean
-            self.variance += share * (x.var(0) - self.variance + (1.0 - share) * apart.square())
-            self.mean += share * apart
-            self.count += len(x)
+        def compute(self, inputs: dict[str, torch.Tensor], role: str) -> Any:
+            return self.net(inputs["observations"]), {}
 
-        def forward(self, x: torch.Tensor) -> torch.Tensor:
-            return ((x - self.mean) / (self.variance.sqrt() + 1e-4)).clamp(-5.0, 5.0)
-
-    class Model(nn.Module):
-        def __init__(self, outputs: int) -> None:
-            super().__init__()
-            self.net = mlp(outputs)
-
-        def compute(self, inputs: dict[str, torch.Tensor], role: str) -> torch.Tensor:
-            return self.net(inputs["states"])  # type: ignore[no-any-return]
-
-    scaler, policy, critic = Scaler(), Model(2), Model(1)
-
-    def mean(x: torch.Tensor) -> torch.Tensor:
-        return policy.compute({"states": scaler(x)}, "policy")
-
-    def value(x: torch.Tensor) -> torch.Tensor:
-        return critic.compute({"states": scaler(x)}, "value").flatten()
-
-    ppo(budget, mean, value, [*policy.parameters(), *critic.parameters()], seed, scaler.watch)
-    return nn.Sequential(scaler, policy.net)
+    set_seed(seed)
+    steps, env = 64, wrap_env(NormalizeReward(budget.environments(), GAMMA), wrapper="gymnasium", verbose=False)
+    spaces = {"observation_space": env.observation_space, "action_space": env.action_space, "device": "cpu"}
+    policy = Policy(**spaces)
+    settings = {
+        "rollouts": steps, "learning_epochs": 5, "mini_batches": max(steps * budget.crystals // 2048, 1),
+        "discount_factor": GAMMA, "gae_lambda": 0.95, "ratio_clip": CLIP, "value_clip": 0.0, "value_loss_scale": 0.5,
+        "learning_rate": 1e-3, "learning_rate_scheduler": torch.optim.lr_scheduler.LambdaLR,
+        "learning_rate_scheduler_kwargs": {"lr_lambda": lambda _: budget.left},
+        "observation_preprocessor": RunningStandardScaler,
+        "observation_preprocessor_kwargs": {"size": env.observation_space, "device": "cpu"},
+        "rewards_shaper": lambda rewards, *_: rewards.clamp(-10.0, 10.0),
+        "experiment": {"write_interval": 0, "checkpoint_interval": 0},
+    }  # fmt: skip
+    memory = RandomMemory(memory_size=steps, num_envs=budget.crystals, device="cpu")
+    agent = PPO(models={"policy": policy, "value": Value(**spaces)}, memory=memory, cfg=settings, **spaces)
+    own = {"timesteps": steps, "headless": True, "disable_progressbar": True, "close_environment_at_exit": False}
+    trainer = SequentialTrainer(env=env, agents=agent, cfg=own)
+    while budget.left:
+        trainer.train()
+        agent.tracking_data.clear()
+        budget.steps += steps * budget.crystals * REPEAT
+    env.close()
+    return nn.Sequential(agent._observation_preprocessor, policy.net)
 
 
 def sbx(budget: Budget, seed: int = 0) -> nn.Module:

@@ -28,9 +28,9 @@ Units = dict[str, tuple[float, float]]
 """Units of a column: the factor to SI, and what is added then."""
 INCH, DAY = 25.4 * MM, 24.0 * HOUR
 DATED = {"iso": "2026-03-01 12:00:05", "dmy": "01.03.2026 12:00:05", "mdy": "03/01/2026 12:00:05", "clock": "12:00:05"}
-"""Times that are no numbers, each with an example; ``clock``, the time of day, may run over midnight."""
+"""Times that are no numbers, each with an example; ``clock``, the time of day, may run over midnight, or count on."""
 TIME: Units = {"s": (1.0, 0.0), "min": (MINUTE, 0.0), "h": (HOUR, 0.0), "d": (DAY, 0.0)}
-TIME |= {"ms": (1e-3, 0.0), "us": (1e-6, 0.0), "ns": (1e-9, 0.0)}
+TIME |= {"ms": (1e-3, 0.0), "us": (1e-6, 0.0), "100ns": (1e-7, 0.0), "ns": (1e-9, 0.0)}
 TIME |= dict.fromkeys(DATED, (1.0, 0.0))
 LENGTH = {"mm": MM, "cm": 10.0 * MM, "m": 1.0, "in": INCH}
 RADIUS: Units = {unit: (size, 0.0) for unit, size in LENGTH.items()}
@@ -54,23 +54,9 @@ REQUIRED, RECORDED = tuple(COLUMNS)[:5], tuple(COLUMNS)[:8]
 """Columns that a log must have, and those that :func:`record_log` writes."""
 DRIVES = "pull_speed_mm_per_min", "heater_power_kW"
 ABSENT = (
-    "",
-    "nan",
-    "null",
-    "none",
-    "na",
-    "n/a",
-    "#n/a",
-    "-",
-    "--",
-    "---",
-    "<na>",
-    "nat",
-    "1.#qnan",
-    "-1.#ind",
-    "1.#inf",
+    "", "nan", "null", "none", "na", "n/a", "#n/a", "-", "--", "---", "<na>", "nat", "1.#qnan", "-1.#ind", "1.#inf",
     "-1.#inf",
-)
+)  # fmt: skip
 """Fields that hold no number."""
 MEANT = "on", "off", "true", "false"
 """Words that stand for a number, so that they are not missing."""
@@ -238,6 +224,8 @@ def _units_meant(text: Any, name: str) -> str:
     best = [each for each in fitting if each[1]] or fitting
     units, spans = [unit for unit, *_ in best], {unit: span for unit, _, span in fitting if unit in ("dmy", "mdy")}
     units = [unit for unit in units if spans.get(unit, 0.0) <= 3.0 * min(spans.values(), default=0.0)]
+    if "iso" in units:  # whose forms the other two read too
+        units = [unit for unit in units if unit not in spans]
     if {"dmy", "mdy"} <= set(units) and "." in text.iloc[0][:6]:
         units.remove("mdy")  # nobody writes the month first between dots
     if not units:
@@ -248,36 +236,14 @@ def _units_meant(text: Any, name: str) -> str:
 MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
 MONTH = {name: n + 1 for n, name in enumerate(MONTHS)}
 MONTH |= {
-    "mär": 3,
-    "mrz": 3,
-    "mae": 3,
-    "mai": 5,
-    "okt": 10,
-    "dez": 12,
-    "fév": 2,
-    "fev": 2,
-    "avr": 4,
-    "jui": 7,
-    "aoû": 8,
-}
-MONTH |= {
-    "déc": 12,
-    "ene": 1,
-    "abr": 4,
-    "ago": 8,
-    "dic": 12,
-    "gen": 1,
-    "mag": 5,
-    "giu": 6,
-    "lug": 7,
-    "set": 9,
-    "ott": 10,
-}
+    "mär": 3, "mrz": 3, "mae": 3, "mai": 5, "okt": 10, "dez": 12, "fév": 2, "fev": 2, "avr": 4, "jui": 7, "aoû": 8,
+    "déc": 12, "ene": 1, "abr": 4, "ago": 8, "dic": 12, "gen": 1, "mag": 5, "giu": 6, "lug": 7, "set": 9, "ott": 10,
+}  # fmt: skip
 """First letters of months in English, German, French, Spanish and Italian."""
 ZONES = {"z": 0, "utc": 0, "gmt": 0, "wet": 0, "bst": 1, "cet": 1, "mez": 1, "cest": 2, "mesz": 2, "eet": 2, "eest": 3}
 ZONES |= {"est": -5, "edt": -4, "cst": -6, "cdt": -5, "mst": -7, "mdt": -6, "pst": -8, "pdt": -7, "jst": 9, "kst": 9}
 """Names of zones, hours from UTC."""
-_WORD = r"[^\W\d_]{3,10}"
+_WORD, _COMPACT = r"[^\W\d_]{3,10}", r"^((?:19|20)\d{6})(\d{6}(?:[.,]\d+)?)"
 _DATE = {
     "ymd": r"(?P<y>\d{4})(?P<s>[-/. ]?)(?P<m>\d{1,2})(?P=s)(?P<d>\d{1,2})",
     "dMy": rf"(?P<d>\d{{1,2}})[-/. ]*(?P<m>{_WORD})[-/., ]*(?P<y>\d{{4}}|\d{{2}})",
@@ -289,8 +255,8 @@ _DATE = {
 _FORMS = {"iso": ("ymd", "dMy", "Mdy", "yMd"), "clock": ()}
 _FORMS |= {unit: (unit, *_FORMS["iso"]) for unit in ("dmy", "mdy")}
 _CLOCK = (
-    r"(?P<H>\d{1,2}):?(?P<M>\d{2})(?::?(?P<S>\d{2})(?:[.,:](?P<f>\d+))?)?\s*(?P<half>[AaPp])?(?(half)\.?[Mm]\.?)"
-    r"\s*(?:(?P<sign>[-+])(?P<zh>\d{2}):?(?P<zm>\d{2})?|(?P<zone>[A-Za-z]{1,4}))?\s*(?:\[[\w/+-]+\])?"
+    r"(?P<H>\d{1,2})[:.]?(?P<M>\d{2})(?:[:.]?(?P<S>\d{2})(?:[.,:](?P<f>\d+))?)?\s*(?P<half>[AaPp])?(?(half)\.?[Mm]\.?)"
+    r"\s*(?:Uhr|(?P<sign>[-+])(?P<zh>\d{2}):?(?P<zm>\d{2})?|(?P<zone>[A-Za-z]{1,4})(?![A-Za-z/]))?\s*(?:\[?[A-Za-z]+/[\w/+-]+\]?)?"
 )
 
 
@@ -300,11 +266,15 @@ def _read_times(text: Any, unit: str) -> tuple[Any, bool]:
 
     factor, _ = TIME[unit]
     if unit not in DATED:
-        return pandas.to_numeric(_plain_numbers(text), errors="coerce").astype(float) * factor, False
+        numbers = text.mask(text.str.fullmatch(_COMPACT)) if unit == "s" else text
+        return pandas.to_numeric(_plain_numbers(numbers), errors="coerce").astype(float) * factor, False
     if unit == "clock":
-        parts = text.str.extract(rf"^{_CLOCK.replace(':?', ':')}$")
-        return _seconds(parts), bool(parts[["sign", "zone"]].isna().all(axis=None))
-    plain = text.str.replace(rf"^{_WORD}\.?,? +(?=\d|{_WORD})", _no_weekday, regex=True)
+        marked = _CLOCK.replace("[:.]?", "[:.]").replace("2", "3", 1)
+        parts = text.str.extract(rf"^(?:(?P<D>\d+) days?,? +)?{marked}$")
+        naive = bool(parts[["sign", "zone"]].isna().all(axis=None))
+        return _seconds(parts, 999.0) + DAY * parts["D"].astype(float).fillna(0.0), naive
+    plain = text.str.replace(_COMPACT, r"\1T\2", regex=True)
+    plain = plain.str.replace(rf"^[^\W\d_]{{2,10}}\.?,? +(?=\d|{_WORD})", _no_weekday, regex=True)
     in_c = (
         rf"^({_WORD}) +(\d{{1,2}}) (\d{{1,2}}:\d{{2}}:\d{{2}})((?: \w{{1,4}})?) (\d{{4}})$"  # Sun Mar  1 12:00:05 2026
     )
@@ -315,7 +285,7 @@ def _read_times(text: Any, unit: str) -> tuple[Any, bool]:
         at = times.isna()
         if not at.any():
             break
-        parts = plain[at].str.extract(rf"^{_DATE[form]}(?:[T ,]+{_CLOCK})?$")
+        parts = plain[at].str.extract(rf"^{_DATE[form]}(?:[Tt ,:]+{_CLOCK})?$")
         month = pandas.to_numeric(parts["m"], errors="coerce")
         month = month.fillna(parts["m"].str.lower().str[:3].map(MONTH)).mask(
             parts["m"].str.lower().isin(["juin", "juni"]), 6.0
@@ -334,12 +304,12 @@ def _no_weekday(match: re.Match[str]) -> str:
     return match[0] if match[0][:3].lower() in MONTH else ""
 
 
-def _seconds(parts: Any) -> Any:
-    """Seconds since midnight in UTC of the parts of times of day; NaN for one that no clock shows."""
+def _seconds(parts: Any, most: float = 24.0) -> Any:
+    """Seconds since midnight in UTC of the parts of times of day; NaN for one that no clock of ``most`` hours shows."""
     hour, minute = (parts[name].astype(float) for name in "HM")
     second = parts["S"].astype(float).fillna(0.0) + ("0." + parts["f"]).astype(float).fillna(0.0)
     half = parts["half"].str.lower()
-    wrong = (minute >= 60.0) | (second >= 61.0) | (hour > 24.0) | (half.notna() & ((hour < 1.0) | (hour > 12.0)))
+    wrong = (minute >= 60.0) | (second >= 61.0) | (hour > most) | (half.notna() & ((hour < 1.0) | (hour > 12.0)))
     hour = hour.where(half.isna(), hour % 12.0 + 12.0 * (half == "p"))
     named = parts["zone"].str.lower().map(ZONES)
     wrong |= parts["zone"].notna() & named.isna()
@@ -534,7 +504,8 @@ def _check_interval(time: Floats, unit: str) -> None:
     sizes = {each: size / now for each, (size, _) in TIME.items() if each not in DATED}
     meant = [each for each, size in sizes.items() if INTERVALS[0] <= interval * size <= INTERVALS[1]]
     dated = [each for each in meant if 9e8 <= time[0] * sizes[each] <= 4.2e9]
-    meant = [each for each in meant if each in dated or (each == "d" and time[0] * sizes[each] > 2e9)] or meant
+    far = {"d": 2e9, "100ns": 1e10}  # a spreadsheet's days; times since 1601 or the year 1
+    meant = [each for each in meant if each in dated or time[0] * sizes[each] > far.get(each, np.inf)] or meant
     hint = f": did you mean time_s=COLUMN:{meant[0]}?" if meant and unit not in DATED else ""
     raise CzError(f"the rows are {interval:.4g} s apart{hint}")
 

@@ -118,6 +118,8 @@ def test_gaps_repeats_jitter_and_outliers_are_counted(logs, rows, tmp_path):
         (every("time_s", lambda time: f"{46082.5 + float(time) / 86400:.8f}"), "did you mean time_s=COLUMN:d?"),
         (every("time_s", lambda time: f"{int((1.7e9 + float(time)) * 1e9)}"), "did you mean time_s=COLUMN:ns?"),
         (every("time_s", lambda time: f"{int((1.7e9 + float(time)) * 1e6)}"), "did you mean time_s=COLUMN:us?"),
+        (every("time_s", lambda time: f"{(13344473600 + int(time)) * 10**7}"), "did you mean time_s=COLUMN:100ns?"),
+        (lambda rows: stamped(rows, "%Y%m%d%H%M%S"), "did you mean time_s=time_s:iso?"),
         (changed("T_1_K", "1785.2 K"), "row 402: T_1_K = '1785.2 K' is no number"),
         (every("T_1_K", "Bad Input"), "row 2: T_1_K = 'Bad Input' is no number"),
         (changed("valid", "maybe"), "row 402: valid = 'maybe' is no quality"),
@@ -211,12 +213,30 @@ FORMATS = {
         lambda rows: stamped(rows, "%a %b %d %H:%M:%S %Y"), "time_s=time_s:iso",
     ),
     "compact times": (lambda rows: stamped(rows, "%Y%m%dT%H%M%S"), "time_s=time_s:iso"),
+    "compact times in one number": (lambda rows: stamped(rows, "%Y%m%d%H%M%S"), "time_s=time_s:iso"),
+    "a colon before the clock, as web servers write it": (
+        lambda rows: stamped(rows, "%d/%b/%Y:%H:%M:%S +0000"), "time_s=time_s:iso",
+    ),
+    "a short weekday, dots and Uhr": (lambda rows: stamped(rows, "So, %d.%m.%Y %H.%M.%S Uhr"), "time_s=time_s:dmy"),
+    "small letters, and a zone by name alone": (
+        lambda rows: stamped(rows, "%Y-%m-%dt%H:%M:%S Europe/Berlin"), "time_s=time_s:iso",
+    ),
+    "elapsed hours of more than a day": (
+        every("time_s", lambda time: f"{30 + int(time) // 3600}:{int(time) // 60 % 60:02}:{int(time) % 60:02}"),
+        "time_s=time_s:clock",
+    ),
+    "differences of times, as pandas writes them": (
+        every("time_s", lambda time: str(pandas.Timedelta(23 * 3600 + int(time), unit="s"))), "time_s=time_s:clock",
+    ),
     "a zone by name (delorean #101)": (
         lambda rows: stamped(rows, "%Y-%m-%dT%H:%M:%S+01:00[Europe/Berlin]"), "time_s=time_s:iso",
     ),
     "AM and PM": (lambda rows: stamped(rows, "%I:%M:%S %p", "2026-03-01T11:00:00"), "time_s=time_s:clock"),
     "AM and PM behind a date": (lambda rows: stamped(rows, "%m/%d/%Y %I:%M:%S %p"), "time_s=time_s:mdy"),
     "days of a spreadsheet (duckle #104)": (serials, "time_s=time_s:d"),
+    "ticks of 100 ns since 1601": (
+        every("time_s", lambda time: str((13_344_473_600 + int(time)) * 10**7)), "time_s=time_s:100ns",
+    ),
     "nanoseconds since 1970": (epochs(10**9), "time_s=time_s:ns"),
     "microseconds since 1970": (epochs(10**6), "time_s=time_s:us"),
     "a next line inside a field": (noted("\x85"),),
