@@ -69,7 +69,8 @@ class Residual:
     def __post_init__(self) -> None:
         if not (0.0 <= self.pull_limit <= 1.0 and 0.0 <= self.limits[1] <= 1.0):
             most = self.base.config.heater_range / KILO
-            raise CzError(f"limits must be a share of v_0 from 0 to 1 and from 0 to {most:g} kW, not {self}")
+            given = f"{self.pull_limit:g} and {self.heater_limit:g} kW"
+            raise CzError(f"limits must be a share of v_0 from 0 to 1 and from 0 to {most:g} kW, not {given}")
 
     @property
     def facts(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import fields as dataclass_fields
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from cz_gym.agents.recipes import (
     CRYSTAL_ENV,
@@ -18,7 +18,7 @@ from cz_gym.agents.recipes import (
     PPOResidual,
     TrainingConfig,
 )
-from cz_gym.agents.residual import Base
+from cz_gym.agents.residual import Base, Residual
 from cz_gym.agents.train import read_settings
 from cz_gym.config import check_config
 from cz_gym.crystal.process import ENVIRONMENTS
@@ -110,7 +110,7 @@ def train(arguments: argparse.Namespace) -> int:
     where = f"{recipe.environment} ({', '.join(recipe.stages)}), " if recipe.environment else ""
     crystals = {ALL.name: "all"}.get(recipe.config.scenario.name, recipe.config.scenario.name)
     print(f"{recipe.name}, {amount} on {where}{crystals}{machine}, into {arguments.out}", flush=True)
-    base = _base_of(recipe)  # a wrong controller is refused before the work
+    base = _base_of(recipe)  # before the work
     options = _measure_references(recipe), arguments.checkpoint_seconds, arguments.plot, callbacks, base
     runs = [TrainingRun(folder, recipe, seed, *options) for folder, seed in zip(folders, seeds, strict=True)]
     if not arguments.seeds:
@@ -127,7 +127,12 @@ def train(arguments: argparse.Namespace) -> int:
 
 
 def _base_of(recipe: TrainingConfig) -> Base | None:
-    return make_base(recipe.controller, recipe.config) if isinstance(recipe, PPOResidual) else None
+    """The controller that a recipe's agents add to; CzError for a wrong one, and for wrong limits."""
+    if not isinstance(recipe, PPOResidual):
+        return None
+    base = make_base(recipe.controller, recipe.config)
+    Residual(base, *recipe.limits)
+    return base
 
 
 def _measure_references(recipe: TrainingConfig) -> Any:
@@ -182,12 +187,17 @@ def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tupl
 def _setting(text: str, recipe: TrainingConfig) -> tuple[str, Any]:
     """The field of a recipe and its value in FIELD=VALUE; CzError for a field or a value that cannot be meant."""
     name, sign, value = (part.strip() for part in text.partition("="))
-    known = {each.name for each in dataclass_fields(recipe)} - {"name", "steps", "environment", "stages"}
+    known = {each.name: each.type for each in dataclass_fields(recipe)}
+    for own in ("name", "steps", "environment", "stages"):
+        del known[own]
     if not sign or name not in known:
         raise CzError(f"--set {text}: {unknown_name_message('field', name, sorted(known))}")
     usual = getattr(recipe, name)
     try:
-        return name, _typed(value, usual)
+        typed = _typed(value, usual)
+        if isinstance(usual, tuple) and Ellipsis not in get_args(known[name]) and len(typed) != len(usual):
+            raise ValueError
+        return name, typed
     except ValueError:
         kind = "numbers with commas between" if isinstance(usual, tuple) else type(usual).__name__
         raise CzError(f"--set {text}: {name} must be {kind}, as {usual!r}") from None

@@ -121,6 +121,19 @@ def test_only_the_controller_of_its_training_is_taken(agent, tmp_path):
             Residual(other, *limits)
 
 
+@pytest.mark.parametrize(
+    ("limits", "said"),
+    [("0.1,99", "limits must be a share of v_0 from 0 to 1 and from 0 to 10 kW, not 0.1 and 99 kW"),
+     ("0.1", "limits must be numbers with commas between, as (0.1, 1.0)")],
+)  # fmt: skip
+def test_wrong_limits_are_refused_before_references_are_measured(limits, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(train, "_measure_references", None)
+    words = ["--algo", "pid-with-learning", "--set", f"limits={limits}", "--out", str(tmp_path / "run")]
+    assert train.main(words) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_crystals")
 def test_one_s_own_controller_learns_and_stands_in_the_benchmark(tmp_path, monkeypatch, capsys):
