@@ -33,7 +33,6 @@ COMMANDS = {
 EXTRAS = {
     **dict.fromkeys(("matplotlib", "tqdm", "pandas", "control", "onnx", "onnxruntime"), "benchmark"),
     **dict.fromkeys(("stable_baselines3", "torch", "filelock"), "agents"),
-    "plotly": "plant",
 }
 """Extras of packages that commands import at their beginning."""
 SOON = 0.5

@@ -21,19 +21,18 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecNorm
 from torch import nn
 
 from cz_gym.config import Config, check_config, make_config
-from cz_gym.env import CzEnv, CzVectorEnv
-from cz_gym.evaluation.protocol import PLANT, REWARD, STATE, VALIDATION_SEEDS, scenarios
+from cz_gym.env import CzEnv
+from cz_gym.evaluation.protocol import PLANT, REWARD, STATE, scenarios
 from cz_gym.sb3 import AddToController, CzVecEnv, environment_steps
 from cz_gym.spaces import observations
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import require_type
-from cz_gym.support.files import write_files
 
 from .apg import APG, RecurrentPolicy
 from .asymmetric import Asymmetric
-from .contract import AgentFileError, Contract, OnnxPolicy, agent_files, facts_of, make_contract
-from .from_torch import export
-from .recipes import JUDGING_SEEDS, validate
+from .contract import AgentFileError, Contract, OnnxPolicy, facts_of, make_contract
+from .from_torch import export, largest_difference, write_validated
+from .recipes import JUDGING_SEEDS
 from .residual import Residual
 
 ALGORITHMS = {
@@ -43,10 +42,6 @@ ALGORITHMS = {
     **{name: f"stable_baselines3:{name.upper()}" for name in ("a2c", "ddpg", "ppo", "sac", "td3")},
 }
 """Algorithms by RL-Zoo's names, and this package's own."""
-SAMPLES, SLOTS = 50, 8
-"""Samples, each of SLOTS crystals, on which file and model must agree."""
-TOLERANCE = 1e-3
-"""Largest difference between their actions [action units]."""
 SAFE_WRAPPERS = (
     "Monitor", "TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics", "RecordVideo",
     "HumanRendering", "NormalizeReward", "TransformReward", "ClipReward", "VecMonitor", "VecNormalize", "VecCheckNan",
@@ -93,31 +88,22 @@ def save_agent(
         normalisation = model.get_vec_normalize_env()
     normalisation = normalisation or None
     agent = to_agent(model, name, int((model.seed if seed is None else seed) or 0), config, normalisation, path)
-    apart = disagreement(agent, model, normalisation, config)
-    if not apart <= TOLERANCE:
-        raise AgentFileError(f"{path}: the file would act otherwise than the model, by up to {apart:.2g}")
-    contract = validate(agent, config, JUDGING_SEEDS).put_into(agent.contract)
-    write_files(agent_files(path, agent.content, contract))
-    return contract
+    return write_validated(agent, config, path, "model", disagreement(agent, model, normalisation, config))
 
 
 def disagreement(
     agent: OnnxPolicy, model: BaseAlgorithm, normalisation: VecNormalize | None, config: Config | None = None
 ) -> float:
     """Largest difference between the actions of file and model, on crystals that the file drives [action units]."""
-    envs = CzVectorEnv.from_config(config or config_of(model), SLOTS)
-    observation, _ = envs.reset(seed=list(VALIDATION_SEEDS[:SLOTS]))
-    apart, memory, recalled = 0.0, None, None
-    starts = np.ones(SLOTS, bool)
-    for _ in range(SAMPLES):
+    memory: Any = None
+
+    def act(observation: Any, starts: Any) -> Any:
+        nonlocal memory
         seen = observation if normalisation is None else normalisation.normalize_obs(observation)
         wanted, memory = model.predict(seen, memory, starts, deterministic=True)
-        action, recalled = agent.predict(observation, recalled, starts)
-        apart = max(apart, float(np.abs(action - wanted).max()))
-        observation, _, terminated, truncated, _ = envs.step(action)
-        starts = terminated | truncated
-    envs.close()
-    return apart
+        return wanted
+
+    return largest_difference(agent, act, config or config_of(model))
 
 
 def config_of(model: BaseAlgorithm, given: Config | None = None) -> Config:

@@ -2,7 +2,7 @@
 
 import io
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,13 +67,20 @@ def save_agent(
             "training_steps": training_steps, "validation_cost": 0.0, "validation_rmse_mm": 0.0,
         }  # fmt: skip
         agent = OnnxPolicy.of(make_contract(content, **facts_of(config), **facts), content, config, path)
-        apart = disagreement(agent, module, config)
+        return write_validated(agent, config, path, "module", disagreement(agent, module, config))
     finally:
         module.train(trained)
-    if not apart <= TOLERANCE:
-        raise AgentFileError(f"{path}: the file would act otherwise than the module, by up to {apart:.2g}")
+
+
+def write_validated(agent: OnnxPolicy, config: Config, path: Path, kind: str, apart: float) -> Contract:
+    """Write an agent of a "module" or "model", from whose actions its own are ``apart``, with its validation figures.
+
+    AgentFileError where they are too far apart.
+    """
     from .recipes import JUDGING_SEEDS, validate
 
+    if not apart <= TOLERANCE:
+        raise AgentFileError(f"{path}: the file would act otherwise than the {kind}, by up to {apart:.2g}")
     contract = validate(agent, config, JUDGING_SEEDS).put_into(agent.contract)
     write_files(agent_files(path, agent.content, contract))
     return contract
@@ -149,21 +156,31 @@ def export(module: nn.Module, examples: Sequence[torch.Tensor], name: str) -> by
 
 def disagreement(agent: OnnxPolicy, module: nn.Module, config: Config) -> float:
     """Largest difference between the actions of file and module, on crystals that the file drives [action units]."""
-    envs = CzVectorEnv.from_config(config, SLOTS)
-    observation, _ = envs.reset(seed=list(VALIDATION_SEEDS[:SLOTS]))
     device = next((each.device for each in module.parameters()), torch.device("cpu"))
-    clipped, apart, recalled = Clipped(module), 0.0, None
-    state = torch.zeros(SLOTS, agent.memory_length, device=device)
-    starts = np.ones(SLOTS, bool)
-    for _ in range(SAMPLES):
+    clipped, state = Clipped(module), torch.zeros(SLOTS, agent.memory_length, device=device)
+
+    def act(observation: Any, starts: Any) -> Any:
+        nonlocal state
         state[torch.as_tensor(starts)] = 0.0
         given = [torch.as_tensor(observation, dtype=torch.float32, device=device), state]
         with torch.no_grad():
             wanted = clipped(*given[: 2 if agent.memory_length else 1])
         if agent.memory_length:
             wanted, state = wanted
-        action, recalled = agent.predict(observation, recalled, starts)
-        apart = max(apart, float(np.abs(action - wanted.cpu().numpy()).max()))
+        return wanted.cpu().numpy()
+
+    return largest_difference(agent, act, config)
+
+
+def largest_difference(agent: OnnxPolicy, act: Callable[[Any, Any], Any], config: Config) -> float:
+    """Largest difference of an agent's actions from those of ``act(observation, starts)`` [action units]."""
+    envs = CzVectorEnv.from_config(config, SLOTS)
+    observation, _ = envs.reset(seed=list(VALIDATION_SEEDS[:SLOTS]))
+    apart, memory, starts = 0.0, None, np.ones(SLOTS, bool)
+    for _ in range(SAMPLES):
+        wanted = act(observation, starts)
+        action, memory = agent.predict(observation, memory, starts)
+        apart = max(apart, float(np.abs(action - wanted).max()))
         observation, _, terminated, truncated, _ = envs.step(action)
         starts = terminated | truncated
     envs.close()

@@ -245,12 +245,7 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base 
     """
     torch.set_num_threads(1)  # small networks are quicker so
     torch.manual_seed(seed)
-    learns = isinstance(recipe, Reinforcement)
-    told = isinstance(recipe, Reinforcement) and recipe.told
-    batch = CzVectorEnv.from_config(
-        recipe.config, recipe.num_envs, AutoresetMode.SAME_STEP, info="all" if told else "lean"
-    )
-    env: VecEnv = CzVecEnv(batch, seed + done if learns else None, critic_state=told)
+    env, told = _environment(recipe, seed + done, base), isinstance(recipe, Reinforcement) and recipe.told
     kind: Any
     policy: Any
     options = dict[str, Any]()
@@ -269,10 +264,6 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base 
     known = {name for each in kind.__mro__ for name in inspect.signature(each.__init__).parameters}
     settings = {name: getattr(recipe, name) for name in asdict(recipe) if name in known}
     if isinstance(recipe, Reinforcement):
-        if isinstance(recipe, PPOResidual):
-            env = AddToController(env, Residual(require_type(Base, base, "it is added to"), *recipe.limits))
-        env = ActionRepeat(env, recipe.action_repeat)
-        env = VecNormalize(env, norm_obs=False, gamma=recipe.gamma)
         settings["learning_rate"] = partial(linear_schedule, recipe.learning_rate)
         options["net_arch"] = {"pi": list(recipe.hidden), critics: list(recipe.critic_hidden)}
     if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer
@@ -283,6 +274,18 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base 
     made.set_random_seed((seed * 10_007 + done) % (len(TRAINING_SEEDS) - recipe.num_envs))
     made.num_timesteps = done // repeat_of(recipe)
     return made
+
+
+def _environment(recipe: TrainingConfig, stagger: int, base: Base | None) -> VecEnv:
+    """The batch of a recipe as its algorithm sees it; ``stagger`` draws where the crystals of a learner begin."""
+    if not isinstance(recipe, Reinforcement):
+        return CzVecEnv(CzVectorEnv.from_config(recipe.config, recipe.num_envs, AutoresetMode.SAME_STEP, info="lean"))
+    info: Any = "all" if recipe.told else "lean"
+    batch = CzVectorEnv.from_config(recipe.config, recipe.num_envs, AutoresetMode.SAME_STEP, info=info)
+    env: VecEnv = CzVecEnv(batch, stagger, critic_state=recipe.told)
+    if isinstance(recipe, PPOResidual):
+        env = AddToController(env, Residual(require_type(Base, base, "it is added to"), *recipe.limits))
+    return VecNormalize(ActionRepeat(env, recipe.action_repeat), norm_obs=False, gamma=recipe.gamma)
 
 
 def repeat_of(recipe: TrainingConfig) -> int:

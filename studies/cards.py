@@ -9,12 +9,13 @@ import pandas as pd
 
 from cz_gym.agents import shipped_names, shipped_seeds
 from cz_gym.agents.contract import Contract, read_agent
-from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.errors import CzError
-from cz_gym.support.files import check_writable, write_files
+from cz_gym.support.files import write_files
 from cz_gym.tools.episodes import by_key, read_estimates
 from cz_gym.tools.report.tables import FAILURES, PULL_STEP, RMSE, Column
 from cz_gym.tools.report.tables import markdown as table
+
+from . import StudyParser
 
 TOLD = (
     "its actions from the reward; a network that estimates the state from sensors was fitted to the true state, "
@@ -85,18 +86,14 @@ def hub_page(name: str, text: str, estimates: pd.DataFrame) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser("python -m studies.cards", __doc__)
-    for option, default, about in (
-        ("--benchmark", "results/benchmark/benchmark.json", "results"),
-        ("--out", "results/cards/cards.md", "file to write"),
-    ):
-        parser.add_argument(option, type=Path, default=Path(default), help=f"{about} (default: %(default)s)")
-    parser.add_argument("--hub", type=Path, metavar="DIR", help="also write a folder an agent, ready for a model hub")
-    return parser.run(_main, arguments, "benchmark")
+    parser = StudyParser("cards", __doc__, "results/cards/cards.md")
+    add, results = parser.add_argument, Path("results/benchmark/benchmark.json")
+    add("--benchmark", type=Path, default=results, help="results (default: %(default)s)")
+    add("--hub", type=Path, metavar="DIR", help="also write a folder an agent, ready for a model hub")
+    return parser.run(_main, arguments)
 
 
 def _main(given: argparse.Namespace) -> None:
-    check_writable(given.out.parent)
     estimates, _ = read_estimates(given.benchmark, [*(column.metric for column in FIGURES), RETURN])
     shipped = {name: how for name, how in AGENTS.items() if name in shipped_names()}
     if estimates.empty or any(shipped.keys() - set(own["controller"]) for _, own in estimates.groupby("scenario")):

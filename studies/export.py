@@ -7,10 +7,8 @@ grows the same crystals itself, and its row of the table stands beside Python's.
 """
 
 import argparse
-import json
 import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -20,13 +18,14 @@ from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.support.command_line import OneLineParser
-from cz_gym.support.files import check_writable, write_files
+from cz_gym.support.files import write_files
 from cz_gym.tools.export.block import in_shares
 from cz_gym.tools.export.controllers import make_block
 from cz_gym.tools.export.shell import Block, BlockPolicy, Runner
 from cz_gym.tools.export.text import CompiledBlock
 from cz_gym.tools.report.tables import markdown
+
+from . import StudyParser, to_json
 
 CONTROLLERS = ("paper", "paper-tuned", "lqg-at-0.02", "gradient", "ppo")
 SCENARIOS = ("randomized", "hard", "sensor-fault", "puller")
@@ -134,20 +133,17 @@ single precision: so much the loop of crystal and controller makes of the sevent
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = OneLineParser("python -m studies.export", "Exported C beside Python on validation crystals.")
-    parser.add_argument("--out", type=Path, default=Path("results/export"), metavar="FOLDER", help="%(default)s")
-    return parser.run(_main, arguments, "benchmark")
+    return StudyParser("export", __doc__, "results/export").run(_main, arguments)
 
 
 def _main(given: argparse.Namespace) -> None:
-    check_writable(given.out)
     rows = list[Row]()
     for controller in CONTROLLERS:
         for scenario in SCENARIOS:
             rows += study(controller, scenario, CRYSTALS)
             print(*rows[-1], flush=True)
-    text = json.dumps({"crystals": CRYSTALS, "rows": [row._asdict() for row in rows]}, indent=1)
-    write_files({given.out / "export.json": text.encode(), given.out / "report.md": report(rows, CRYSTALS).encode()})
+    text = to_json({"crystals": CRYSTALS, "rows": [row._asdict() for row in rows]})
+    write_files({given.out / "export.json": text, given.out / "report.md": report(rows, CRYSTALS).encode()})
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from cz_gym.tools.export.shell import Block, BlockPolicy, Runner
 from cz_gym.tools.export.text import CompiledBlock
 from cz_gym.tools.report.tables import markdown
 
-from .common import StudyParser
+from . import StudyParser
 
 CONTROLLERS, CRYSTALS = ("lqg-at-0.02", "paper-tuned", "fallback", "gradient"), 100
 GONE = 0.5 * HOUR, 2.5 * HOUR
@@ -251,7 +251,7 @@ def faults_of(name: str) -> list[str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = StudyParser("faults", "Blocks in compiled C under the faults of a plant.", "results/faults")
+    parser = StudyParser("faults", __doc__, "results/faults")
     parser.add_argument("controllers", nargs="*", help=f"names ({', '.join(CONTROLLERS)})")
     about = "test crystals (%(default)s)"
     parser.add_argument("--crystals", type=between(1, 500), default=CRYSTALS, metavar="N", help=about)

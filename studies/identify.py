@@ -35,7 +35,7 @@ from cz_gym.tools.identify.estimate import PRIOR_SD
 from cz_gym.tools.identify.moves import measure_excitation
 from cz_gym.tools.report.tables import markdown
 
-from .common import StudyParser
+from . import StudyParser
 
 PULLERS, CRYSTALS = 20, 20
 """Number of pullers, and of crystals of each."""

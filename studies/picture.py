@@ -28,7 +28,7 @@ from cz_gym.tools.report import vector
 from cz_gym.tools.report.markdown import fill_in
 from cz_gym.tools.run import read_benchmark
 
-from .common import StudyParser
+from . import StudyParser
 
 SEED = 23
 SIDES = {"pid-uncompensated": "PID on the ring", "lqg-one-design": "LQG with a model of the ring"}

@@ -32,7 +32,7 @@ from cz_gym.support.files import name_file_in_errors, write_files
 from cz_gym.support.units import MINUTE, MM, MM_PER_MIN
 from cz_gym.tools.registry import make_controller
 
-from .common import StudyParser
+from . import StudyParser
 
 PAGE = Path("docs/_root/play.html")
 SEEDS = TEST_SEEDS[:5]

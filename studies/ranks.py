@@ -16,10 +16,9 @@ from scipy.linalg import solve_discrete_are
 from scipy.optimize import brentq
 from scipy.stats import kendalltau
 
-from cz_gym.agents import load, shipped_names
 from cz_gym.baselines.lqg_filter import DRIFT, NoiseModel, plant_model
 from cz_gym.body.process import OUTPUTS, linearise, radius_model
-from cz_gym.config import Config, make_config
+from cz_gym.config import Config
 from cz_gym.episodes.scenario import Interface, Scenario, Sensor
 from cz_gym.episodes.scenarios import MELT_LAYER, RANDOMIZED, RANDOMIZED_TRACED
 from cz_gym.evaluation.metrics import metrics
@@ -31,10 +30,10 @@ from cz_gym.physics.plant import Puller, make_puller
 from cz_gym.support.command_line import between
 from cz_gym.support.files import write_files
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
-from cz_gym.tools.registry import make_controller
 from cz_gym.tools.report.tables import markdown
 
-from .common import StudyParser
+from . import StudyParser
+from .robustness import policy_and_config
 
 CONTROLLERS = ("paper", "paper-filtered", "paper-tuned", "lqg-at-0.02", "lqg-one-design", "gradient", "ppo", "sac",
                "ppo-plain")  # fmt: skip
@@ -93,13 +92,6 @@ def variants() -> list[Variant]:
         Variant("traced ring (`randomized-traced`)", RANDOMIZED_TRACED),
         *(Variant(f"phi_b {deg:g} deg", pullers(ring_slope=float(np.radians(deg)))) for deg in (2.0, 7.0)),
     ]  # fmt: skip
-
-
-def policy_for(name: str) -> tuple[Any, Config]:
-    """A controller or a shipped agent as it is on ``randomized``, and that environment."""
-    own = load(name).settings if name in shipped_names() else {"observation": "measured", "action": "direct"}
-    config = make_config("randomized", **own)
-    return (load(name, config) if name in shipped_names() else make_controller(name, config)), config
 
 
 def errors(policy: Any, designed_for: Config, scenario: Scenario, parameters: Parameters, crystals: int) -> Any:
@@ -241,7 +233,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(given: argparse.Namespace) -> None:
     names, moved = given.controllers or CONTROLLERS, dict[str, dict[str, Any]]()
-    policies = {name: policy_for(name) for name in names}
+    policies = {name: policy_and_config(name, "randomized", 3.0) for name in names}
     for each in variants():
         moved[each.about] = {
             name: errors(*policies[name], each.scenario, each.parameters, given.crystals) for name in names

@@ -12,16 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from cz_gym.evaluation.metrics import metrics
-from cz_gym.evaluation.protocol import VALIDATION_SEEDS, find_case
+from cz_gym.evaluation.protocol import RANDOM_CASES, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.support.command_line import between
 from cz_gym.support.files import write_files
 from cz_gym.tools.registry import load_agent, make_controller
 from cz_gym.tools.report.tables import markdown
 
-from .common import StudyParser
+from . import StudyParser
 
-SCENARIOS = "randomized", "hard", "sensor-fault", "puller", "hot-zone"
 JUDGED = VALIDATION_SEEDS[264:]
 """Seeds of crystals that no training run has chosen or judged its agent by."""
 HEADS = "scenario", "controller", "cost", "of the PID's cost", "RMSE [mm]", "pull step RMS [mm/min]", "lost [%]"
@@ -32,8 +31,8 @@ def rows(files: Sequence[Path], crystals: int) -> Iterator[tuple[str, ...]]:
     agents = [*map(load_agent, files)]
     residual: Any = agents[0].residual
     name = residual.base.label.split(" ")[0]
-    for scenario in SCENARIOS:
-        config = find_case(scenario).design_config("history")
+    for case in RANDOM_CASES:
+        config = case.design_config("history")
         policies = {name: residual.controller, f"{name}, tuned for it": make_controller(name, config)}
         policies |= {f"{name} + learning, seed {each.contract.training_seed}": each for each in agents}
         alone = 0.0
@@ -44,7 +43,15 @@ def rows(files: Sequence[Path], crystals: int) -> Iterator[tuple[str, ...]]:
                 for each in (found.cost, found.rmse_mm, found.pull_step_rms_mm_per_min, found.failure_rate)
             )
             alone = alone or cost
-            yield scenario, words, f"{cost:.4f}", f"{cost / alone:.2f}", f"{rmse:.3f}", f"{step:.4f}", f"{100 * lost:g}"
+            yield (
+                case.name,
+                words,
+                f"{cost:.4f}",
+                f"{cost / alone:.2f}",
+                f"{rmse:.3f}",
+                f"{step:.4f}",
+                f"{100 * lost:g}",
+            )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -24,7 +24,7 @@ from cz_gym.support.units import HOUR
 from cz_gym.tools.registry import make_controller
 from cz_gym.tools.report.tables import markdown
 
-from .common import StudyParser
+from . import StudyParser
 
 CONTROLLERS = "paper-tuned", "lqg", "lqg-at-0.02", "gradient"
 FACTORS = tuple(float(f"{each:.2f}") for each in np.geomspace(1.1, 4.0, 8))

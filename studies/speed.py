@@ -25,7 +25,7 @@ from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.errors import software
 from cz_gym.support.files import check_writable, write_files
 
-from .common import to_json
+from . import to_json
 
 QUICK, FULL = 3, 15
 """Rounds of a measurement."""

@@ -21,7 +21,7 @@ from cz_gym.support.files import write_files
 from cz_gym.tools.registry import make_controller
 from cz_gym.tools.report.tables import markdown
 
-from .common import StudyParser
+from . import StudyParser
 
 MILLION = 1_000_000
 SHORT = (MILLION // 4, MILLION // 2)

@@ -251,7 +251,8 @@ CASES: tuple[Case, ...] = (
     ),
 )
 """Every case, in the order of tables; families of disturbances alone and variants of randomized run when asked for."""
-
+RANDOM_CASES = tuple(case for case in CASES if case.default and not case.deterministic)
+"""Those of several crystals that run unasked."""
 
 _GROWN = {
     "crown": "from the neck to 60 mm of body",

@@ -48,12 +48,6 @@ Claims = Mapping[str, tuple[float, str]]
 """RMSE [mm] on the first case, and the contract, that each submission claims."""
 
 
-def random_cases(first_seed: int) -> list[protocol.Case]:
-    """The benchmark's cases of several crystals, from this seed on."""
-    random = (case for case in protocol.CASES if case.default and not case.deterministic)
-    return [replace(case, first_seed=first_seed) for case in random]
-
-
 def budget(contender: protocol.Contender) -> str:
     """The smallest budget that the trainings of an agent keep."""
     steps = max(policy.contract.training_steps for policy in contender.trained)
@@ -119,7 +113,7 @@ def _main(given: argparse.Namespace) -> None:
     if not submitted:
         raise CzError(f"{given.folder}: no submissions: each is a folder with agent files and benchmark.json")
     first = given.first_seed or FRESH[secrets.randbelow(len(FRESH) - len(protocol.TEST_SEEDS))]
-    cases = random_cases(first)
+    cases = [replace(case, first_seed=first) for case in protocol.RANDOM_CASES]
     agents = [contender for contender, _ in submitted]
     check_agents(agents, cases)
     contenders = [*(each for each in CONTROLLERS if each.quoted), *agents]

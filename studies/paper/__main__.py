@@ -16,7 +16,7 @@ from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.support.files import write_files
 from cz_gym.support.units import HOUR, MM
 from cz_gym.tools.report.tables import markdown as table
-from studies.common import StudyParser, to_json
+from studies import StudyParser, to_json
 
 from . import experiments as ex
 from .experiments import COMPENSATOR, CROSSOVER, ODE, PHASE_MARGIN_DEG, PID, PUBLISHED, ZERO

@@ -70,7 +70,7 @@ def puller(tmp_path_factory):
 def screen(puller, tmp_path_factory):
     with chromium(tmp_path_factory.mktemp("profile")) as driver:
         driver.get(f"http://127.0.0.1:{puller.page}/")
-        until(driver, lambda: len(driver.find_elements("css selector", "#charts .main-svg")) >= 4)
+        until(driver, lambda: len(driver.find_elements("css selector", "#charts svg")) >= 4)
         yield driver
 
 
@@ -87,7 +87,8 @@ def test_it_shows_what_the_tags_say_and_goes_on(puller, screen):
     names = [" ".join(row[:2]) for row in rows[1:]]
     assert names == ["ring radius", "pull speed", "heater power", "heater T_1"]
     assert float(rows[1][2]) == pytest.approx(101.4, abs=1.0)
-    script = "return [...document.querySelectorAll('#charts section')].map(c => c.data[0].x.length)"
+    points = "[...c.querySelectorAll('path')].at(-1).getAttribute('d').split('L').length"
+    script = f"return [...document.querySelectorAll('#charts section')].map(c => {points})"
     shown = screen.execute_script(script)
     assert len(shown) == 4
     assert min(shown) > 3

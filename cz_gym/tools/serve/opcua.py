@@ -27,7 +27,6 @@ from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric.rsa import RSAPrivateKey
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID
-from plotly.offline import get_plotlyjs
 
 from cz_gym.rendering.canvas import load
 from cz_gym.support.errors import CzError
@@ -321,12 +320,11 @@ class Page:
         self.certificates = certificates
         app = web.Application(middlewares=[self._guard], client_max_size=1000)
         app.add_routes([
-            web.get("/", self._html), web.get("/plotly.js", self._plotly), web.get("/data", self._data),
-            web.get("/crystal.png", self._crystal), web.get("/login", self._login), web.post("/setpoints", self._write),
+            web.get("/", self._html), web.get("/data", self._data), web.get("/crystal.png", self._crystal),
+            web.get("/login", self._login), web.post("/setpoints", self._write),
         ])  # fmt: skip
         self._runner = web.AppRunner(app, access_log=None)
         self._picture: tuple[int, bytes] = -1, b""
-        self._script = get_plotlyjs().encode()
 
     async def __aenter__(self) -> "Page":
         host, port = self.place
@@ -382,10 +380,6 @@ class Page:
 
     async def _html(self, _: web.Request) -> web.Response:
         return web.Response(text=HTML.read_text("utf-8"), content_type="text/html")
-
-    async def _plotly(self, _: web.Request) -> web.Response:
-        headers = {"Cache-Control": "max-age=86400"}
-        return web.Response(body=self._script, content_type="text/javascript", charset="utf-8", headers=headers)
 
     async def _login(self, _: web.Request) -> web.Response:
         raise web.HTTPSeeOther("/")
