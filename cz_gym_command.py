@@ -14,7 +14,7 @@ from pathlib import Path
 from threading import Timer
 
 COMMANDS = {
-    "list": ("cz_gym.tools.listing", "names of controllers, agents, scenarios, pullers, stages"),
+    "list": ("cz_gym.tools.registry", "names of controllers, agents, scenarios, pullers, stages"),
     "train": ("cz_gym.tools.train", "train an agent by a recipe"),
     "benchmark": ("cz_gym.tools.benchmark", "compare controllers and agents on the same crystals"),
     "tune": ("cz_gym.tools.tune", "search settings of controllers, or design them for a puller"),

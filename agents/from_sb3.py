@@ -258,12 +258,7 @@ def main(argv: list[str] | None = None) -> int:
     add = parser.add_argument
     add("model", type=Path, help="saved model (.zip)")
     add("--algo", choices=sorted(ALGORITHMS), required=True, help="algorithm, by RL-Zoo's name")
-    add(
-        "--vecnormalize",
-        type=Path,
-        metavar="PKL",
-        help="saved VecNormalize that it was trained in (default: none)",
-    )
+    add("--vecnormalize", type=Path, metavar="PKL", help="saved VecNormalize that it was trained in (default: none)")
     add("--name", help="what the agent is called (default: the agent file's name)")
     about = "what it was trained on: a name, all, FILE.py:NAME or A=0.6,B=0.4 (default: %(default)s)"
     parser.add_scenario(about, "randomized")

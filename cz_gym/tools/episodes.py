@@ -56,11 +56,6 @@ controller that ranks first.
 Line = tuple[str, str, str, str, str, float, float, float, int]
 
 
-def metric_columns(episodes: pd.DataFrame) -> list[str]:
-    """Return the names of the metrics of a table of episodes."""
-    return [name for name in episodes.columns if name not in (*KEYS, SPEED, OUTSIDE, CONTRACT, CODE)]
-
-
 def values_of(rows: pd.DataFrame, metrics: Sequence[str]) -> Floats:
     """Return metrics of one controller on one scenario, shape (training seeds, crystals, metrics).
 
@@ -104,7 +99,8 @@ class _Scenario:
 
     def __init__(self, rows: Mapping[str, pd.DataFrame], bound: pd.DataFrame | None, resamples: Any) -> None:
         self.rows, self.bound, self.resamples = rows, bound, resamples
-        self.metrics = metric_columns(next(iter(rows.values())))
+        others = (*KEYS, SPEED, OUTSIDE, CONTRACT, CODE)
+        self.metrics = [name for name in next(iter(rows.values())).columns if name not in others]
         self.values = {name: values_of(own, self.metrics) for name, own in rows.items()}
 
     def first(self, name: str, crystals: int) -> Floats:

@@ -48,8 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "Keys: up and down change the pull speed, right and left the heater, ten times as fast with shift; Esc ends.",
     )
     add = parser.add_argument
-    parser.add_scenario("scenario (%(default)s)", "randomized")
-    add("--seed", type=between(0, 2**31 - 1), default=1, metavar="N", help="which crystal (%(default)s)")
+    add_crystal(parser)
     add("--speed", type=between(5, 300), default=60, metavar="N", help="times faster than real time (%(default)s)")
     add(
         "--minutes",
@@ -57,10 +56,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         metavar="M",
         help="length of the run (180; of a stage 1.3 times its recipe's)",
     )
-    about = f"part of a whole crystal, CzCrystal-v0: {', '.join(STAGES)}, or a length [m]"
-    add("--stage", type=named, metavar="STAGE", help=about)
     parser.add_puller("pull its crystals")
     return parser.run(_play, arguments, "render")
+
+
+def add_crystal(parser: OneLineParser) -> None:
+    """Add the options that say which crystal is pulled."""
+    parser.add_scenario("scenario (%(default)s)", "randomized")
+    add, about = parser.add_argument, f"part of a whole crystal, CzCrystal-v0: {', '.join(STAGES)}, or a length [m]"
+    add("--seed", type=between(0, 2**31 - 1), default=1, metavar="N", help="which crystal (%(default)s)")
+    add("--stage", type=named, metavar="STAGE", help=about)
+
+
+def crystal_config(given: argparse.Namespace, horizon: float | None, action: str) -> Config:
+    """The environment of the crystal that the options name, for ``horizon`` [s]."""
+    return make_config(
+        scenarios(given.scenario), None, "measured", horizon=horizon, action=action,
+        puller=chosen_puller(given.puller), process=BODY if given.stage is None else CRYSTAL, stage=given.stage,
+    )  # fmt: skip
 
 
 def keys_to_actions() -> dict[tuple[int, ...], Action]:
@@ -94,12 +107,8 @@ def score(config: Config, seed: int, actions: Sequence[Action], failed: bool) ->
 
 
 def _play(arguments: argparse.Namespace) -> None:
-    puller, pygame, stage = chosen_puller(arguments.puller), load(), arguments.stage
-    scenario, horizon = scenarios(arguments.scenario), arguments.minutes and arguments.minutes * MINUTE
-    config = make_config(
-        scenario, None, "measured", horizon=horizon, action="rate",
-        puller=puller, process=BODY if stage is None else CRYSTAL, stage=stage,
-    )  # fmt: skip
+    pygame = load()
+    config = crystal_config(arguments, arguments.minutes and arguments.minutes * MINUTE, "rate")
     if sys.platform.startswith(("linux", "freebsd")) and not any(map(os.environ.get, DISPLAYS)):
         raise CzError(NO_DISPLAY)
     pygame.display.init()

@@ -1,12 +1,15 @@
-"""Controllers by name: the classical ones of each environment, and those that tools choose by themselves."""
+"""Controllers by name, those of each environment; ``cz-gym list`` prints the names that commands take."""
 
+import argparse
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from inspect import signature
 from pathlib import Path
+from textwrap import wrap
 
+from cz_gym.agents import shipped_names, shipped_seeds
 from cz_gym.agents.contract import OnnxPolicy, read_agent
 from cz_gym.agents.residual import Base
 from cz_gym.baselines import tuned_controllers as tuned
@@ -19,10 +22,11 @@ from cz_gym.baselines.tuned import TunedController
 from cz_gym.body.process import BODY
 from cz_gym.config import Config, check_config, make_config
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.episodes.scenarios import RANDOMIZED
-from cz_gym.evaluation.protocol import Contender, unchanged, user_controller
+from cz_gym.episodes.scenarios import ALL, RANDOMIZED, SCENARIOS
+from cz_gym.evaluation.protocol import CASES, CRYSTAL_CASES, GROUPS, Contender, unchanged, user_controller
 from cz_gym.process import Process
-from cz_gym.puller.file import PullerFile
+from cz_gym.puller.file import FOLDER, PullerFile
+from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.errors import CzError, unknown_name_message
 
 
@@ -99,10 +103,7 @@ CONTROLLERS: tuple[Contender, ...] = (
 CRYSTAL_CONTROLLERS: tuple[Contender, ...] = (
     Contender("recipe", partial(unchanged, OpenLoop()), "measured", "the recipe's pull speed and power, no feedback"),
     Contender(
-        "ring-pid",
-        partial(scale_crystal, tuned.RING_PID),
-        "measured",
-        "PID on the bright ring with the body's gains",
+        "ring-pid", partial(scale_crystal, tuned.RING_PID), "measured", "PID on the bright ring with the body's gains"
     ),
     *(each.contender for each in tuned.CRYSTALS),
     Contender(
@@ -169,3 +170,79 @@ def load_agent(path: str | Path, puller: PullerFile | None = None, controllers: 
         raise CzError(f"{path}: adds to the controller {name}: name its file too, --controller FILE.py:NAME")
     config = make_config("randomized", puller=puller, control_interval=contract.control_interval)
     return OnnxPolicy.load(path, base=make_base(place, config))
+
+
+# The names that commands take, each with the line that its registry has on it.
+
+WIDTH = 80
+"""Width of the lines [characters]."""
+Section = tuple[str, list[tuple[str, str]]]
+"""Heading, and names with a line each."""
+
+
+def controllers() -> Iterator[Section]:
+    """Classical controllers of each environment."""
+    for environment, known in KNOWN.items():
+        yield f"controllers of {environment}", [(each.name, each.meaning) for each in known]
+
+
+def scenarios() -> Iterator[Section]:
+    """Scenarios of crystals, and those that the benchmark alone knows."""
+    told = {each.name: each.meaning for each in CASES}
+    yield (
+        "scenarios",
+        [(name, told[name]) for name in told if name in SCENARIOS] + [("all", f"in training: {ALL.name}")],
+    )
+    yield "scenarios of the benchmark alone", [(name, told[name]) for name in told if name not in SCENARIOS]
+
+
+def stages() -> Iterator[Section]:
+    """Parts of a whole crystal."""
+    grown = [case for case in CRYSTAL_CASES if case.scenario == "randomized"]
+    others = dict.fromkeys(f"-{case.scenario}" for case in CRYSTAL_CASES if case.scenario != "randomized")
+    heading = f"stages of CzCrystal-v0; scenarios of its benchmark, with {', '.join(others)} too"
+    yield heading, [(case.name, case.meaning) for case in grown]
+
+
+def pullers() -> Iterator[Section]:
+    """Shipped pullers, each with the first sentence of its file."""
+    files = {path.stem: path.read_text("utf-8").splitlines() for path in sorted(FOLDER.glob("*.toml"))}
+    heads = {name: " ".join(line.strip("# ") for line in lines if line[:1] == "#") for name, lines in files.items()}
+    yield "pullers", [(name, head.partition(". ")[0]) for name, head in heads.items()]
+
+
+def shipped_agents() -> Iterator[Section]:
+    """Shipped agents of each environment."""
+    for environment in KNOWN:
+        lines = []
+        for name in shipped_names(environment):
+            seeds = shipped_seeds(name)
+            contract = read_agent(seeds[0])[0]
+            source = GROUPS.get(contract.learned_from, contract.learned_from)
+            trained_on = "all" if contract.scenario == ALL.name else contract.scenario
+            lines.append((name, f"{source}; {len(seeds)} training seeds, on {trained_on}"))
+        yield f"agents of {environment}", lines
+
+
+KINDS: dict[str, Callable[[], Iterator[Section]]] = {
+    "controllers": controllers, "scenarios": scenarios, "stages": stages, "pullers": pullers, "agents": shipped_agents,
+}  # fmt: skip
+"""Lists by the word that asks for them."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = OneLineParser("cz-gym list", "List the names that commands take, with a line on each.")
+    add, about = parser.add_argument, f"{', '.join(KINDS)} (all of them)"
+    add("kinds", nargs="*", choices=[*KINDS, []], default=[], metavar="KIND", help=about)
+    return parser.run(_main, arguments, "benchmark")
+
+
+def _main(given: argparse.Namespace) -> None:
+    for kind in given.kinds or KINDS:
+        for heading, lines in KINDS[kind]():
+            column = max(len(name) for name, _ in lines) + 4
+            texts = [(f"{heading}:", ""), *((f"  {name:<{column - 2}}{about}", " " * column) for name, about in lines)]
+            for text, indent in texts:
+                print(*wrap(text, WIDTH, subsequent_indent=indent, break_on_hyphens=False), sep="\n")
+            print()

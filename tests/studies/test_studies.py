@@ -102,7 +102,7 @@ MEAN = {"mean": 0.0125, "ci95": None}
 @pytest.fixture
 def submissions(tmp_path, monkeypatch):
     """A folder with one submission, the shipped PPO under another name, with a claim that is too good."""
-    monkeypatch.setattr(protocol, "CASES", CASES[:1])
+    monkeypatch.setattr(protocol, "RANDOM_CASES", CASES[:1])
     monkeypatch.setattr(leaderboard, "CONTROLLERS", leaderboard.CONTROLLERS[:2])
     folder = tmp_path / "submissions" / "mine"
     folder.mkdir(parents=True)

@@ -39,15 +39,13 @@ def _slice(x: Any, starts: Any, ends: Any, axes: Any = None, steps: Any = None) 
     return x[tuple(key)]
 
 
-def _split(x: Any, lengths: Any = None, axis: int = 0, parts: int = 1) -> Any:
-    return np.split(x, parts if lengths is None else np.cumsum(lengths)[:-1].tolist(), axis)
-
-
 OPERATORS: dict[str, Callable[..., Any]] = {
     "Add": np.add, "Sub": np.subtract, "Mul": np.multiply, "Div": np.divide, "MatMul": np.matmul, "Gemm": _gemm,
-    "Slice": _slice, "Split": _split, "Concat": lambda *x, axis: np.concatenate(x, axis=axis), "Identity": lambda x: x,
+    "Slice": _slice, "Concat": lambda *x, axis: np.concatenate(x, axis=axis), "Identity": lambda x: x,
     "Clip": lambda x, low=None, high=None: np.clip(x, low, high), "Tanh": np.tanh,
     "Relu": lambda x: np.maximum(x, 0.0), "Sigmoid": lambda x: 0.5 + 0.5 * np.tanh(0.5 * x),
+    "Split": lambda x, lengths=None, axis=0, parts=1: np.split(
+        x, parts if lengths is None else np.cumsum(lengths)[:-1].tolist(), axis),
 }  # fmt: skip
 """ONNX operators of MLPs, GRUs and LSTMs with tanh, relu and sigmoid, in NumPy."""
 

@@ -137,10 +137,11 @@ def result(benchmark: Benchmark) -> str:
     shown = chosen(benchmark, cases[0], NAMED)
     looks = looks_of(benchmark)
     known = {(case.name, each.name): benchmark.get(case, each.name, RMSE.metric) for case in cases for each in shown}
-    reached = [value for found in known.values() if found for value in (found.mean, *found.ends)]
+    there = [found for found in known.values() if found]
+    reached = [value for found in there for value in (found.mean, *found.ends)]
     room = (WIDTH - LABELS - 12.0) / len(cases)
     bottom = TOP + ROW * len(shown)
-    crystals = max((found.n for found in known.values() if found), default=0)
+    crystals = max((found.n for found in there), default=0)
     parts = [text(12.0, 26.0, "Error of the radius, RMSE [mm]: further left is better", font_weight="bold")]
     for number, case in enumerate(cases):
         left = LABELS + number * room
@@ -148,15 +149,13 @@ def result(benchmark: Benchmark) -> str:
         plain = f"{PLAIN[case.name]} ({case.name})" if case.name in PLAIN else case.name
         parts += [text(axis.start, TOP - 12.0, plain, class_="faint", font_size="17"), *_scale(axis, TOP, bottom)]
         for row, each in enumerate(shown):
-            y = TOP + (row + 0.5) * ROW
-            parts += [line(axis.start, y, axis.end, y, "grid")]
-            if found := known[case.name, each.name]:
-                parts += _row(axis, y, found, looks[each.name], is_told(each, case))
+            parts += _row(
+                axis, TOP + (row + 0.5) * ROW, known[case.name, each.name], looks[each.name], is_told(each, case)
+            )
     for row, each in enumerate(shown):
         parts += [text(LABELS - 4.0, TOP + (row + 0.5) * ROW + 5.5, short(each.name), "end")]
     told = "which scenario it meets" if any(each.told for each in shown) else "what no sensor shows"
-    hollow = any(is_told(each, cases[0]) for each in shown)
-    parts += _key(bottom + 52.0, f"hollow: told {told}" if hollow else "", any(each.learned for each in shown))
+    parts += _key(bottom + 52.0, f"hollow: told {told}", shown, cases[0])
     bars = f"; bars are 95 % intervals over {crystals} test crystals" if crystals > 1 else ""
     parts += [text(12.0, bottom + 84.0, f"mean of all crystals, lost ones included{bars}", class_="faint")]
     return svg(bottom + 100.0, parts, "Radius error of each controller: " + _spoken(known))
@@ -175,20 +174,23 @@ def _scale(axis: Axis, top: float, bottom: float) -> list[str]:
     return parts
 
 
-def _row(axis: Axis, y: float, found: Estimate, look: Style, told: bool) -> list[str]:
-    """Mark and interval of a controller, or its number where the axis does not reach."""
+def _row(axis: Axis, y: float, found: Estimate | None, look: Style, told: bool) -> list[str]:
+    """A controller's line, with its mark and interval, or its number where the axis does not reach."""
+    parts = [line(axis.start, y, axis.end, y, "grid")]
+    if found is None:
+        return parts
     if not axis.holds(found.mean):
-        return [text(axis.end, y + 5.0, f"{found.mean:.3g} →", "end", class_="faint")]
+        return [*parts, text(axis.end, y + 5.0, f"{found.mean:.3g} →", "end", class_="faint")]
     low, high = found.ends
-    return [bar(axis.at(low), y, axis.at(high), y, look), mark(axis.at(found.mean), y, look, told)]
+    return [*parts, bar(axis.at(low), y, axis.at(high), y, look), mark(axis.at(found.mean), y, look, told)]
 
 
-def _key(y: float, told: str, learned: bool) -> list[str]:
-    """Say what the kinds of marks mean."""
-    ink = Style(COLOURS[-1], "circle", ())
+def _key(y: float, told: str, shown: Iterable[Contender], case: Case) -> list[str]:
+    """Say what the kinds of marks mean that there are."""
+    ink, shown = Style(COLOURS[-1], "circle", ()), [*shown]
     keys = [(ink, False, "classical")]
-    keys += [(ink._replace(mark="diamond"), False, "diamonds: learned")] if learned else []
-    keys += [(ink, True, told)] if told else []
+    keys += [(ink._replace(mark="diamond"), False, "diamonds: learned")] if any(each.learned for each in shown) else []
+    keys += [(ink, True, told)] if any(is_told(each, case) for each in shown) else []
     parts, x = [], 22.0
     for look, hollow, words in keys:
         parts += [mark(x, y, look, hollow), text(x + 16.0, y + 5.5, words)]

@@ -10,14 +10,10 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
-from cz_gym.body.process import BODY
-from cz_gym.config import make_config
-from cz_gym.crystal.plant import STAGES, named
-from cz_gym.crystal.process import CRYSTAL
-from cz_gym.evaluation.protocol import scenarios
 from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import HOUR
+from cz_gym.tools.play import add_crystal, crystal_config
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,12 +30,9 @@ def commands() -> OneLineParser:
     )
     add = parser.add_argument
     parser.add_puller("the puller behind the server, at its control interval")
-    parser.add_scenario("scenario (%(default)s)", "randomized")
-    add("--seed", type=between(0, 2**31 - 1), default=1, metavar="N", help="which crystal (%(default)s)")
+    add_crystal(parser)
     add("--speed", type=between(0, 10_000), default=1, metavar="N",
         help="times faster than real time; 0: every step waits for its setpoints (%(default)s)")  # fmt: skip
-    add("--stage", type=named, metavar="STAGE",
-        help=f"part of a whole crystal, CzCrystal-v0: {', '.join(STAGES)}, or a length [m]")  # fmt: skip
     add("--hours", type=between(1, 1000), metavar="N", help="length of the run (3; of a stage 1.3 times its recipe's)")
     add("--wait", action="store_true", help="time begins with the first setpoints of a client")
     add("--watchdog", type=between(5, 86_400), default=60, metavar="S",
@@ -95,12 +88,8 @@ async def serving(arguments: argparse.Namespace, access: Any) -> AsyncIterator[t
         await certify(arguments.certificates)
     log = LogFile(arguments.log, 1e6 * (arguments.log_size or math.inf)) if arguments.log else None
     state = StateFile(arguments.state) if arguments.state else None
-    horizon, puller, stage = arguments.hours and arguments.hours * HOUR, arguments.puller, arguments.stage
-    process, kind = (BODY, Machine) if stage is None else (CRYSTAL, CrystalMachine)
-    scenario = scenarios(arguments.scenario)
-    config = make_config(
-        scenario, None, "measured", horizon=horizon, action="direct", puller=puller, process=process, stage=stage
-    )
+    config = crystal_config(arguments, arguments.hours and arguments.hours * HOUR, "direct")
+    kind = Machine if arguments.stage is None else CrystalMachine
     machine = kind(config, arguments.seed, arguments.watchdog, log, state)
     loop, queue = asyncio.get_running_loop(), asyncio.Queue[dict[str, Any]]()
     clock = Clock(
