@@ -13,8 +13,7 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.puller.file import PullerFile, find_puller
 from cz_gym.support.files import write_files
 from cz_gym.tools.identify import Excited, identify, read_log, record_log
-from cz_gym.tools.identify.command import report
-from cz_gym.tools.identify.file import puller_text
+from cz_gym.tools.identify.command import puller_text, report
 from cz_gym.tools.registry import make_controller
 
 

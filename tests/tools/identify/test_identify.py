@@ -22,8 +22,8 @@ from cz_gym.tools.export.controllers import make_block
 from cz_gym.tools.export.text import CompiledBlock
 from cz_gym.tools.identify import Excited, command, identify, read_log, record_log
 from cz_gym.tools.identify import model as model_of_log
+from cz_gym.tools.identify.command import puller_text
 from cz_gym.tools.identify.estimate import HEATER, LAGS, PULL, coloured, misfits
-from cz_gym.tools.identify.file import puller_text
 from cz_gym.tools.identify.log import Log, prepare, shift_drives
 from cz_gym.tools.identify.model import LAM, Lags, Model, NoiseLevels, heating, predict, sensitivities
 from cz_gym.tools.identify.moves import CHIPS, SEQUENCE, measure_excitation
