@@ -25,7 +25,7 @@ COMMANDS = {
     "puller": ("cz_gym.tools.puller", "print what a puller file implies"),
     "recipe": ("cz_gym.tools.recipe", "set points of a whole crystal against its length"),
     "export": ("cz_gym.tools.export.command", "write a controller or agent as code for a PLC"),
-    "serve": ("cz_gym.tools.serve.command", "run a virtual puller on OPC UA"),
+    "serve": ("cz_gym.tools.serve", "run a virtual puller on OPC UA"),
     "play": ("cz_gym.tools.play", "pull a crystal by hand"),
     "data": ("cz_gym.tools.datasets", "record datasets for offline learning"),
 }

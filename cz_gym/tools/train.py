@@ -173,8 +173,7 @@ def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tupl
         raise CzError(f"{name!r} is no recipe here: name one of {', '.join(recipes)} by --algo")
     own = recipes[name]
     fields = {each.name for each in dataclass_fields(own)} - {"name", "steps"}
-    known = {field: settings[field] for field in fields & settings.keys()}
-    chosen = {field: tuple(value) if isinstance(value, list) else value for field, value in known.items()}
+    chosen = {field: _listed(settings[field], getattr(own, field)) for field in fields & settings.keys()}
     given = {"scenario": arguments.scenario, "puller": arguments.puller}
     chosen |= {field: value for field, value in given.items() if value}
     chosen |= dict(_setting(text, own) for text in arguments.set)
@@ -219,6 +218,10 @@ def _typed(text: str, usual: Any) -> Any:
     if not math.isfinite(number) or (number <= 0 and usual > 0 and not 0 <= number == int(number)):
         raise ValueError
     return number
+
+
+def _listed(value: Any, usual: Any) -> Any:
+    return tuple(value) if isinstance(usual, tuple) else value
 
 
 def _absolute(place: str) -> str:

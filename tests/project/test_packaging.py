@@ -206,7 +206,7 @@ USES = {
     "mpc": "from examples.mpc import mpc; import cz_gym.config as c; mpc(c.make_config('nominal')).programme",
     "data": "run('data --policies paper --scenarios nominal --episodes 1 --out', out)",
     "cluster": "import cz_gym.evaluation.parallel as c, distributed; distributed.Client; c.versions()",
-    "plant": "import cz_gym.tools.serve.command; run('export --plant --to fmu --out', out)",
+    "plant": "import cz_gym.tools.serve.opcua; run('export --plant --to fmu --out', out)",
 }
 """What a user of each extra does with it."""
 

@@ -13,7 +13,7 @@ pytest.importorskip("asyncua", reason="asyncua is absent: pip install '.[plant]'
 from asyncua import Client, ua
 from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 
-from cz_gym.tools.serve.command import access_control, commands, serving
+from cz_gym.tools.serve import access_control, commands, serving
 from cz_gym.tools.serve.machine import TAGS
 from cz_gym.tools.serve.opcua import KINDS, URI
 

@@ -26,11 +26,11 @@ from cz_gym.config import make_config
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import KILO, MM, MM_PER_MIN
+from cz_gym.tools import serve
 from cz_gym.tools.export.block import SETPOINT_NAMES
 from cz_gym.tools.export.controllers import make_block
 from cz_gym.tools.export.shell import BlockPolicy
 from cz_gym.tools.identify.log import read_log
-from cz_gym.tools.serve import command
 from cz_gym.tools.serve.opcua import certify
 from examples import opcua_controller
 from tests.conftest import ROOT
@@ -308,31 +308,31 @@ def test_a_killed_server_leaves_a_whole_log_and_goes_on_with_the_same_crystal(tm
 
 
 def test_it_listens_on_the_loopback_unless_told_and_elsewhere_only_with_a_user(refused, monkeypatch):
-    assert command.commands().parse_args([]).host == "127.0.0.1"
+    assert serve.commands().parse_args([]).host == "127.0.0.1"
     for host in ("0.0.0.0", "::", "192.168.1.7", "puller.local"):
-        assert "--operator and its password are needed" in refused(command.main, ["--host", host])
+        assert "--operator and its password are needed" in refused(serve.main, ["--host", host])
     monkeypatch.delenv("CZ_GYM_OPERATOR_PASSWORD", raising=False)
-    assert "CZ_GYM_OPERATOR_PASSWORD" in refused(command.main, ["--host", "0.0.0.0", "--operator", "olga"])
+    assert "CZ_GYM_OPERATOR_PASSWORD" in refused(serve.main, ["--host", "0.0.0.0", "--operator", "olga"])
     monkeypatch.setenv("CZ_GYM_OPERATOR_PASSWORD", "short")
-    assert "at least 8 characters" in refused(command.main, ["--operator", "olga"])
-    assert re.search("did you mean", refused(command.main, ["--scenario", "pulller"]))
-    assert "did you mean 'whole'?" in refused(command.main, ["--stage", "whol"])
-    assert "stage = 9 m begins outside of the crystal" in refused(command.main, ["--stage", "9"])
+    assert "at least 8 characters" in refused(serve.main, ["--operator", "olga"])
+    assert re.search("did you mean", refused(serve.main, ["--scenario", "pulller"]))
+    assert "did you mean 'whole'?" in refused(serve.main, ["--stage", "whol"])
+    assert "stage = 9 m begins outside of the crystal" in refused(serve.main, ["--stage", "9"])
 
 
 def test_a_port_that_is_taken_and_half_a_certificate_are_said_in_one_line(puller, refused, tmp_path, monkeypatch):
     wait_until((puller.folder / "log.csv").exists)
-    assert "log.csv: File exists" in refused(command.main, ["--log", str(puller.folder / "log.csv")])
+    assert "log.csv: File exists" in refused(serve.main, ["--log", str(puller.folder / "log.csv")])
     taken = ["--port", str(puller.port), "--page-port", "0", "--log", str(tmp_path / "new.csv")]
-    assert "address already in use" in refused(command.main, taken).lower()
+    assert "address already in use" in refused(serve.main, taken).lower()
     assert not (tmp_path / "new.csv").exists(), "it would stand in the corrected command's way"
     monkeypatch.setenv("CZ_GYM_OPERATOR_PASSWORD", PASSWORD)
     (tmp_path / "key.pem").touch()
     options = ["--host", "0.0.0.0", "--operator", "olga", "--certificates", str(tmp_path)]
-    assert "both certificate.pem and key.pem" in refused(command.main, options)
+    assert "both certificate.pem and key.pem" in refused(serve.main, options)
     for place in (tmp_path / "key.pem", Path("/proc/none")):
-        assert str(place) in refused(command.main, [*options[:-1], str(place)])
-    assert "--log-size divides" in refused(command.main, ["--log-size", "5"])
+        assert str(place) in refused(serve.main, [*options[:-1], str(place)])
+    assert "--log-size divides" in refused(serve.main, ["--log-size", "5"])
 
 
 def pair(folder, days=(-1, 1), kind="rsa", secret=None, other=False, damaged=None):
