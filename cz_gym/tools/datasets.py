@@ -8,7 +8,6 @@ import argparse
 import os
 import re
 import shutil
-import sys
 import time
 import warnings
 from collections.abc import Sequence
@@ -297,7 +296,3 @@ def _write_one(
     dataset = write(*task, seeds, noise, **settings)
     said = f"{dataset.id}: {dataset.total_episodes} episodes, {dataset.total_steps:,} steps, "
     return f"{said}{dataset.storage.get_size():.0f} MB, {time.perf_counter() - began:.1f} s, into {root}"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

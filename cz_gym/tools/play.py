@@ -135,7 +135,3 @@ def _play(arguments: argparse.Namespace) -> None:
     play(env, fps=fps, callback=watch, keys_to_action=keys, seed=arguments.seed, noop=still)
     if actions:
         print(score(config, arguments.seed, actions, failed))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -175,7 +175,7 @@ def test_environment_and_baselines_need_neither_torch_nor_plots():
     python("-W", "error", "-c", ABSENT.replace("{absent}", repr(absent)) + SMOKE, cwd=ROOT)
 
 
-@pytest.mark.parametrize("command", ["train.py", "benchmark.py", "-m cz_gym bode", "-m cz_gym.tools.datasets"])
+@pytest.mark.parametrize("command", ["train.py", "benchmark.py", "-m cz_gym bode", "-m cz_gym data"])
 def test_outside_the_virtual_environment_one_line_says_so(command):
     line = [sys.executable, "-S", *command.split()]
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, env={"PATH": os.environ["PATH"]})
