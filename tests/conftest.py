@@ -36,19 +36,34 @@ if sys.platform == "win32":
 
 
 def pytest_sessionstart():
-    """Of parallel workers one compiles what most tests need, kernels and large packages; the others then load it."""
-    if "PYTEST_XDIST_WORKER" in os.environ and importlib.util.find_spec("filelock"):
-        from cz_gym import CzEnv
-        from cz_gym.support.files import locked
+    """Parallel workers begin with different parts of what most tests need: each compiles, then loads the others'."""
+    if "PYTEST_XDIST_WORKER" not in os.environ or not importlib.util.find_spec("filelock"):
+        return
+    from cz_gym import CzEnv
+    from cz_gym.config import make_config
+    from cz_gym.crystal.process import CRYSTAL
+    from cz_gym.engine.tangents import DifferentiableBatch
+    from cz_gym.support.files import locked
 
-        CACHE.mkdir(parents=True, exist_ok=True)
-        with locked(CACHE, patience=3600.0):
-            for package in LARGE:
-                with suppress(ImportError):
-                    importlib.import_module(package)
-            env = CzEnv(observation="camera")
-            env.reset(seed=0)
-            env.step(np.zeros(2, np.float32))
+    def stepped(**settings):
+        env = CzEnv(**settings)
+        env.reset(seed=0)
+        env.step(np.zeros(2, np.float32))
+
+    def derivatives():
+        batch = DifferentiableBatch(make_config(observation="measured", action="direct"), 1)
+        batch.reset([0])
+        batch.step(np.zeros((1, 2)))
+
+    parts = [lambda: stepped(observation="camera"), lambda: stepped(process=CRYSTAL), derivatives]
+    first = int(os.environ["PYTEST_XDIST_WORKER"].removeprefix("gw")) % len(parts)
+    for number in (*range(first, len(parts)), *range(first)):
+        (CACHE / f"part-{number}").mkdir(parents=True, exist_ok=True)
+        with locked(CACHE / f"part-{number}", patience=3600.0):
+            parts[number]()
+    for package in LARGE:
+        with suppress(ImportError):
+            importlib.import_module(package)
 
 
 def python(*arguments: str, cwd: Path = ROOT, env: dict[str, str] | None = None) -> str:

@@ -170,7 +170,10 @@ class Integrating:
 
 MIX = {"crown": 0.4, "body": 0.3, "tail": 0.3}
 BOTH = {"tank": {"process": TANK}, "crystal": {"process": CRYSTAL, "stage": MIX}}
-processes = pytest.mark.parametrize("given", BOTH.values(), ids=BOTH)
+processes = pytest.mark.parametrize(
+    "given", [pytest.param(BOTH["tank"], marks=pytest.mark.slow), BOTH["crystal"]], ids=[*BOTH]
+)
+"""No cache keeps the code of a test's own process: every run compiles the tank for a minute."""
 
 
 @processes
@@ -219,6 +222,7 @@ def test_states_continue_bit_for_bit_with_what_the_process_added(given):
         np.testing.assert_array_equal(again[1], gained)
 
 
+@pytest.mark.slow
 def test_the_tank_is_the_equations_solution():
     env = CzEnv(process=TANK, action="direct", **{**SETTINGS, "scenario": "nominal"})
     env.reset(seed=0)
@@ -232,6 +236,7 @@ def test_the_tank_is_the_equations_solution():
     assert (info["h"], info["T"]) == pytest.approx(tuple(exact), rel=1e-10)
 
 
+@pytest.mark.slow
 def test_it_ends_with_success_once_enough_was_fed():
     env = CzEnv(process=TANK, **{**SETTINGS, "scenario": "nominal", "horizon": 12000.0}, action="direct")
     env.reset(seed=0)
@@ -244,6 +249,7 @@ def test_it_ends_with_success_once_enough_was_fed():
     assert env._batch.memory.slots["fed"][0] == pytest.approx(0.2, abs=20 * PULL_SCALE)
 
 
+@pytest.mark.slow
 def test_a_pid_in_rollout_and_table(tmp_path):
     """Against a policy that does nothing; metrics of what a tank has not are left out."""
     row = Case("tank", "randomized", "a tank", process=TANK)
@@ -265,7 +271,7 @@ def _still(self, observation, state=None, episode_start=None, deterministic=True
     return np.zeros((len(observation), 2), np.float32), None
 
 
-@pytest.mark.slow  # compiles for half a minute, whatever was kept: the process is the test's own
+@pytest.mark.slow
 def test_its_step_has_derivatives():
     """Of state, inputs, what is carried on and cost, against differences."""
     config = make_config("nominal", action="direct", process=TANK)

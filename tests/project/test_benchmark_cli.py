@@ -28,9 +28,7 @@ from cz_gym.support.errors import CzError
 from cz_gym.tools import benchmark, run
 from cz_gym.tools.episodes import read_episodes, values_of
 from cz_gym.tools.registry import CONTROLLERS
-from cz_gym.tools.report import vector
-from cz_gym.tools.report.markdown import summary
-from cz_gym.tools.run import check_targets, read_benchmark
+from cz_gym.tools.run import check_targets
 from tests.conftest import python
 from tests.contracts import LINEAR, facts, model_of
 from tests.observed import PLAIN
@@ -97,13 +95,6 @@ def test_the_folder_holds_every_file_and_nothing_else(finished):
     for image, begins in (("crystal.png", b"\x89PNG\r\n\x1a\n"), ("result.svg", b"<svg "), ("pareto.svg", b"<svg ")):
         assert (finished / image).read_bytes().startswith(begins)
         assert f"]({image})" in report
-
-
-def test_pictures_and_tables_are_made_again_from_the_file_of_results(finished):
-    again = read_benchmark(finished / "benchmark.json")
-    for name, draw in (("result.svg", vector.result), ("pareto.svg", vector.pareto)):
-        assert vector.as_file(draw(again)) == (finished / name).read_bytes()
-    assert summary(again) in (finished / "report.md").read_text()
 
 
 @pytest.fixture(scope="module")

@@ -16,11 +16,9 @@ from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.evaluation.metrics import metrics
-from cz_gym.evaluation.plots import RING, TRUE, lighter, styles
 from cz_gym.evaluation.rollout import Playback, rollout
 from cz_gym.physics.plant import NO_DISTURBANCE, State
 from cz_gym.process import Inputs
-from cz_gym.rendering import canvas
 from cz_gym.support.units import KILO, MINUTE, MM_PER_MIN
 from cz_gym.tools.registry import make_controller
 from studies import play
@@ -147,17 +145,6 @@ def test_a_step_is_accepted_as_in_the_environment(tmp_path):
     code = """((task, p, points) => points.map(([x, next]) =>
         accept({ task, p, x }, next, { v_p: p.v_0 }, { dT_i: 0 }, p.r_0)))"""
     assert javascript(f"{code}(...{json.dumps(given)})", tmp_path) == [[list(x), bool(grows)] for x, grows in expected]
-
-
-def test_its_colours_are_those_of_every_figure():
-    looks = styles(play.RIVALS)
-    light, dark = (re.findall(r"--(ring|truth|paper|lqg): (#\w+)", part) for part in TEXT.split("@media")[:2])
-    own = {"ring": RING, "truth": TRUE, **{name: look.colour for name, look in looks.items()}}
-    window = {"ring": canvas.CAMERA, "truth": canvas.TRUE}
-    own_dark = {name: "#{:02X}{:02X}{:02X}".format(*colour) for name, colour in window.items()}
-    own_dark |= {name: lighter(look.colour) for name, look in looks.items()}
-    assert {name: colour.upper() for name, colour in light} == own
-    assert {name: colour.upper() for name, colour in dark} == own_dark
 
 
 def unpacked(text, kind):

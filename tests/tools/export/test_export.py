@@ -279,11 +279,15 @@ def test_faults_lose_no_crystal(fault):
     assert row.lost == row.helpless
 
 
+@cache
+def grown(fault):
+    return grow(block_of("paper-tuned"), fault, 3, in_language(CompiledBlock, "paper-tuned"), 5400.0)
+
+
 @needs_compiler
 @pytest.mark.parametrize("fault", ["heater reads 1.03", "drives read wrong, draw 1", "ring steps by -2 mm"])
 def test_readings_that_err_cost_no_radius(fault):
-    block, compiled = block_of("paper-tuned"), in_language(CompiledBlock, "paper-tuned")
-    exact, row = (grow(block, each, 3, compiled, 5400.0) for each in ("none", fault))
+    exact, row = grown("none"), grown(fault)
     assert row.lost == 0
     assert row.rmse < 1.2 * exact.rmse
 

@@ -74,6 +74,7 @@ def test_the_heat_is_the_power_late_and_slow(dead_time, lag):
     np.testing.assert_allclose(heating(log, Lags(lag, dead_time)).real, exact, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_slow_drives_count_and_a_limit_does_not(tmp_path):
     for seed in range(5):
         for moves, limits in ((0.025, SLOW), (0.0, SLOW), (0.0, {})):
