@@ -18,6 +18,7 @@ from cz_gym.config import Config, check_config
 from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.puller.file import DEFAULT
 from cz_gym.spaces import ACTIONS, CLIP, TargetEnv, observations, tag
+from cz_gym.support.command_line import missing
 from cz_gym.support.errors import CzError
 from cz_gym.support.files import write_files
 
@@ -408,7 +409,7 @@ def _session(path: str | Path, onnx_bytes: bytes, channels: int) -> tuple[Any, i
 
         clean, state = check_graph(onnx_bytes, channels)
     except ImportError:
-        raise AgentFileError('running agents needs onnx and onnxruntime: pip install ".[benchmark]"') from None
+        raise AgentFileError(f"running agents: {missing('onnx or onnxruntime', 'benchmark')}") from None
     except GraphError as error:
         raise AgentFileError(f"{path}: {error}") from None
     options = onnxruntime.SessionOptions()

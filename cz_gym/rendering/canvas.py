@@ -17,6 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.error import DependencyNotInstalled
 
+from cz_gym.support.command_line import missing
+
 Colour = tuple[int, int, int]
 
 BACK: Colour = (13, 17, 23)
@@ -43,7 +45,7 @@ ON_MELT: Colour = (60, 20, 0)
 CRYSTAL: Colour = (104, 112, 128)
 
 Frame = npt.NDArray[np.uint8]
-MISSING = 'rendering needs pygame: pip install ".[render]"'
+MISSING = missing("pygame", "render")
 FINE = 2
 """Drawn pixels along each side of a pixel of the picture."""
 FONTS = Path(__file__).parent / "fonts"
