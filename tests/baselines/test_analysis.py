@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.signal import invres, residue
 
-from cz_gym import make_puller
+from cz_gym import Parameters, make_puller
 from cz_gym.baselines import OpenLoop, margins
 from cz_gym.baselines import analysis as loops
 from cz_gym.baselines.analysis import NO_LAGS, Lags, close, linear_controller, linear_form, loop_margins
@@ -23,7 +23,6 @@ from cz_gym.body.signals import Measured
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Scenario, Sensor
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.physics.parameters import Parameters
 from cz_gym.process import StateSpace
 from cz_gym.spaces import MEASURED
 from cz_gym.support.units import MM

@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from cz_gym import CzVectorEnv, State
 from cz_gym.baselines import clairvoyant
 from cz_gym.baselines.clairvoyant import Clairvoyant, Limits, future_of, limits_of, mean_pull, optimise
 from cz_gym.body.signals import Cost, cost_terms
 from cz_gym.config import make_config
-from cz_gym.env import CzVectorEnv
 from cz_gym.episodes.scenario import Actuators
 from cz_gym.episodes.scenarios import HARD, RANDOMIZED
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import Playback, rollout
-from cz_gym.physics.plant import State
 from cz_gym.process import Inputs
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN

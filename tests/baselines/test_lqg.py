@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
-from cz_gym import SCENARIOS, CzVectorEnv, make_puller
+from cz_gym import HURLE, SCENARIOS, CzVectorEnv, decode, make_puller
 from cz_gym.baselines import lqg
 from cz_gym.baselines.analysis import close, linear_form
 from cz_gym.baselines.clairvoyant import episodes_of, pullers_of
@@ -20,11 +20,9 @@ from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Interface, Told
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.plant import Disturbance, State, hidden_load, quintic, rates
 from cz_gym.process import Inputs
 from cz_gym.puller.file import find_puller
-from cz_gym.spaces import decode
 from cz_gym.support.errors import map_arrays
 from cz_gym.support.units import HOUR, KILO, MINUTE, MM, MM_PER_MIN
 from cz_gym.tools.registry import CONTROLLERS, find_controller, make_controller

@@ -9,7 +9,7 @@ import pytest
 from scipy import signal
 from scipy.signal import lfilter
 
-from cz_gym import make_puller
+from cz_gym import Parameters, make_puller
 from cz_gym.baselines.analysis import linear_form, loop_margins
 from cz_gym.baselines.pid import CompensatedPID, Compensator, FilteredPID, SeriesPID, StandardPID, TemperatureLoop
 from cz_gym.baselines.policy import DriveLimits
@@ -20,7 +20,6 @@ from cz_gym.body.signals import Measured
 from cz_gym.config import make_config
 from cz_gym.episodes.scenarios import RANDOMIZED
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.physics.parameters import Parameters
 from cz_gym.process import PULL_SCALE
 from cz_gym.spaces import HEATER_RANGE, MEASURED
 from cz_gym.support.units import MM, MM_PER_MIN

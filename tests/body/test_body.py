@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from cz_gym import SCENARIOS, CzEnv, CzVectorEnv, Parameters, State, make_puller
+from cz_gym import SCENARIOS, CzEnv, CzVectorEnv, Parameters, State, decode, make_puller
 from cz_gym.body.process import BODY, OUTPUTS, linearise, radius_model
 from cz_gym.body.signals import PULL_TOLERANCE, Cost, Weights, coefficients, cost_slopes, cost_terms, reward
 from cz_gym.config import make_config
@@ -22,7 +22,6 @@ from cz_gym.physics.meniscus import hurle_slope
 from cz_gym.physics.plant import NO_DISTURBANCE, Disturbance, disturbance, growth, hidden_load, rates, within_limits
 from cz_gym.process import Inputs, jacobian
 from cz_gym.puller.file import PullerFile
-from cz_gym.spaces import decode
 from cz_gym.support.units import HOUR, MM
 from cz_gym.tools.registry import find_controller
 from tests.equations import Truth, design_rates, drawn, fields, hold, integrated

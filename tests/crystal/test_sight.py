@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from cz_gym import HURLE, decode
 from cz_gym.camera.image import first_row, grey_value
 from cz_gym.camera.view import Camera, make_scene, make_view, project
 from cz_gym.config import make_config
@@ -10,8 +11,6 @@ from cz_gym.crystal import recipe, sight
 from cz_gym.crystal.process import CRYSTAL, linear_recipe, nominal_recipe
 from cz_gym.env import CzCrystalEnv, CzCrystalVectorEnv
 from cz_gym.episodes.draw import Episode
-from cz_gym.physics.meniscus import HURLE
-from cz_gym.spaces import decode
 from cz_gym.support.units import MM
 
 PULLERS = "default", "silicon-300mm", "germanium"

@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import cz_gym
-from cz_gym import Parameters, make_puller
+from cz_gym import Parameters, decode, make_puller
 from cz_gym.body.process import BODY
 from cz_gym.config import make_config
 from cz_gym.crystal import plant, recipe, signals
@@ -28,7 +28,6 @@ from cz_gym.physics.plant import DRAW_SPAN, melt_left
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.process import Inputs, rk4
 from cz_gym.puller.file import DEFAULT, PullerFile, find_puller, from_toml
-from cz_gym.spaces import decode
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import HOUR, MM
 from cz_gym.tools import recipe as command

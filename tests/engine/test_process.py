@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode
 from scipy.integrate import solve_ivp
 from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
-from cz_gym import CzEnv, CzVectorEnv
+from cz_gym import CzEnv, CzVectorEnv, check_vector_env
 from cz_gym.body.signals import WEIGHTS, Cost, cost_slopes, cost_terms, reward
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
@@ -29,7 +29,6 @@ from cz_gym.process import DONE, GROWS, LOST, PULL_SCALE, Channel, Inputs, Past,
 from cz_gym.tools.report.tables import rows
 from cz_gym.tools.report.task_records import BODY_DRIVES, BODY_ERROR
 from cz_gym.tools.run import run as benchmark
-from cz_gym.vector_checker import check_vector_env
 
 # The process: at most 80 lines to the mark below.
 LEVEL, FALL, MM = Channel("m", 1e-3, "level above reference"), Channel("m/s", PULL_SCALE, "inflow above nominal"), 1e-3

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import cz_gym
-from cz_gym import CzEnv, CzVectorEnv
+from cz_gym import CzEnv, CzVectorEnv, Parameters
 from cz_gym.agents import load
 from cz_gym.baselines import CompensatedPID, OpenLoop
 from cz_gym.body.signals import Logged, Measured
@@ -18,7 +18,6 @@ from cz_gym.config import make_config
 from cz_gym.evaluation import plot
 from cz_gym.evaluation.protocol import user_controller
 from cz_gym.evaluation.rollout import Playback, check_seeds, replay, rollout
-from cz_gym.physics.parameters import Parameters
 from cz_gym.support.errors import CzError
 from cz_gym.tools.registry import make_controller
 from tests.observed import PLAIN

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cz_gym import SCENARIOS, CzEnv
-from cz_gym.physics.parameters import Parameters
+from cz_gym import SCENARIOS, CzEnv, Parameters
 from tests.observed import PLAIN
 
 FILE = Path(__file__).with_name("trajectories.json")

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cz_gym import SCENARIOS, CzEnv, CzVectorEnv, Parameters, make_puller
+from cz_gym import HURLE, SCENARIOS, CzEnv, CzVectorEnv, Parameters, make_puller
 from cz_gym.body.process import OUTPUTS, accept_substep, linearise, radius_model
 from cz_gym.config import make_config
 from cz_gym.crystal.process import APART, CRYSTAL, lengths, nominal_recipe
@@ -16,7 +16,6 @@ from cz_gym.crystal.recipe import RecipeRow
 from cz_gym.episodes.draw import Episode, Factors, episode_from_key, new_series, randomised
 from cz_gym.episodes.scenarios import TRACED_SLOPE
 from cz_gym.physics import plant as schedules
-from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.parameters import MACHINE, SIZES, check_parameters
 from cz_gym.physics.plant import HEIGHT_MIN, Disturbance, State, disturbance, drift, quintic, recipe, reference, rk4
 from cz_gym.process import Inputs

@@ -14,14 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cz_gym import agents
+from cz_gym import HURLE, agents
 from cz_gym.agents import shipped_names
 from cz_gym.agents.contract import write_agent
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import SPEED, Metrics, names_of
 from cz_gym.evaluation.parallel import run_tasks
 from cz_gym.evaluation.protocol import CASES, TEST_SEEDS, find_case
-from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.spaces import OBSERVATIONS
 from cz_gym.support.errors import CzError

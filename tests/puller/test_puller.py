@@ -7,10 +7,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from cz_gym import SCENARIOS, CzVectorEnv, decode, make_puller
+from cz_gym import SCENARIOS, CzEnv, CzVectorEnv, decode, make_puller
 from cz_gym.config import Config, make_config
 from cz_gym.engine.tangents import DifferentiableBatch
-from cz_gym.env import CzEnv
 from cz_gym.episodes.scenarios import ALL, HARD, PULLER, RANDOMIZED, adapt_scenario
 from cz_gym.physics.parameters import MACHINE, CrystalRecipe, Parameters
 from cz_gym.puller import file as files

@@ -18,10 +18,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import cz_gym_command
-from cz_gym import __version__
+from cz_gym import SCENARIOS, __version__
 from cz_gym.agents import shipped_names
 from cz_gym.crystal.plant import STAGES
-from cz_gym.episodes.scenarios import SCENARIOS
 from cz_gym.evaluation.protocol import CASES
 from cz_gym.support import files
 from cz_gym.support.command_line import OPTIONAL, between, run_command

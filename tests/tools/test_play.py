@@ -6,9 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from cz_gym import CzEnv
+from cz_gym import CzEnv, make_puller
 from cz_gym.config import make_config
-from cz_gym.physics.plant import make_puller
 from cz_gym.rendering import canvas
 from cz_gym.tools import play
 from cz_gym.tools.registry import find_controller

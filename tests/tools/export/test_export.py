@@ -15,11 +15,10 @@ from hypothesis import strategies as st
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO
 
-from cz_gym import CzEnv, agents
+from cz_gym import CzEnv, CzVectorEnv, agents
 from cz_gym.agents.from_sb3 import to_onnx
 from cz_gym.body.signals import Measured
 from cz_gym.config import make_config
-from cz_gym.env import CzVectorEnv
 from cz_gym.spaces import DRIVE_CHANNELS, HEATER_RANGE, decode, drives_of, readable
 from cz_gym.support.errors import CzError
 from cz_gym.tools.export import controllers

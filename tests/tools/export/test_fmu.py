@@ -7,9 +7,8 @@ import fmpy
 import pytest
 from fmpy.validation import validate_fmu
 
-from cz_gym import CzEnv, make_puller
+from cz_gym import CzEnv, decode, make_puller
 from cz_gym.puller.file import find_puller
-from cz_gym.spaces import decode
 from cz_gym.support.units import MM
 from cz_gym.tools.export.block import SETPOINT_NAMES, in_plant_units, in_shares, nominal_puller
 from cz_gym.tools.export.command import main

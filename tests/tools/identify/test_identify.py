@@ -8,11 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cz_gym import CzEnv, Parameters
+from cz_gym import CzEnv, Parameters, make_puller
 from cz_gym.baselines.policy import OpenLoop
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Reference
-from cz_gym.physics.plant import make_puller
 from cz_gym.puller.file import DEFAULT, PullerFile, find_puller, read_puller, write_puller
 from cz_gym.spaces import HEATER_RANGE, MEASURED, TargetEnv, decode
 from cz_gym.support.errors import CzError
