@@ -1,11 +1,15 @@
 """Robustness of controllers and agents alike, measured on crystals: ``python -m studies.robustness NAME...``.
 
-A wrapper around the policy multiplies the pull speed's move that it asks for, or holds its actions back by whole
-control intervals; the drive's reading shows what was applied. The largest change counts at which no crystal is lost and
-the mean error at most doubles, by bisection on a grid.
+What is altered stands between the drives and the crystal: the pull speed's deviation from nominal has another size, or
+both drives act later by whole control intervals, while every reading shows the drives as they were asked for. An
+agent's moves become setpoints first, as in an export: an agent that reads its drives would set a wrong move right, and
+seem to bear any. The largest change counts at which no crystal is lost and the mean error at most doubles, by
+bisection on a grid.
 """
 
 import argparse
+import csv
+import io
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,61 +18,85 @@ from typing import Any
 import numpy as np
 
 from cz_gym.agents import load, shipped_names
+from cz_gym.body.signals import Measured, moved_mean
 from cz_gym.config import Config, make_config
 from cz_gym.evaluation.metrics import metrics
-from cz_gym.evaluation.protocol import TEST_SEEDS
+from cz_gym.evaluation.protocol import CASES, TEST_SEEDS, find_case
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.process import scales
+from cz_gym.spaces import MEASURED, decode
 from cz_gym.support.command_line import between
 from cz_gym.support.files import write_files
 from cz_gym.support.units import HOUR
+from cz_gym.tools.export.controllers import Agent
 from cz_gym.tools.registry import make_controller
-from cz_gym.tools.report.tables import markdown
+from cz_gym.tools.report.tables import ROBUSTNESS, ROBUSTNESS_MEANS, beyond, markdown
+from cz_gym.tools.report.task_records import contract_hash
 
 from . import StudyParser
 
-CONTROLLERS = "paper-tuned", "lqg", "lqg-at-0.02", "gradient"
+CONTROLLERS = (
+    "paper", "paper-tuned", "pid-conventional", "lqg", "lqg-at-0.02", "lqg-one-design", "lqg-robust",
+    "gradient", "ppo", "sac", "ppo-plain",
+)  # fmt: skip
+SCENARIO = find_case("randomized", CASES)
+"""Its drives follow at once, and their readings are exact."""
 FACTORS = tuple(float(f"{each:.2f}") for each in np.geomspace(1.1, 4.0, 8))
 """Factors on the pull's effect, and divisors of it [-]."""
 SAMPLES = tuple(range(1, 17))
 """Extra delays, in control intervals."""
 WORSE = 2.0
 """Largest ratio of the radius error to that without a change [-]."""
+PULL, HEATER, MEAN = (Measured._fields.index(name) for name in ("v_p", "Q_H", "v_p_mean"))
+"""Places of the drives in "measured"."""
 
 
 @dataclass(frozen=True)
-class Altered:
-    """A policy whose pull moves have another size, and whose actions are late."""
+class Setpoints:
+    """An agent whose actions are setpoints of the drives, whatever moves it was trained to make."""
 
-    policy: Any
-    factor: float = 1.0
-    late: int = 0
-    """Number of control intervals."""
-
-    @property
-    def made_for(self) -> Any:
-        """The environment that the policy was made for."""
-        return getattr(self.policy, "made_for", None)
+    agent: Agent
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[Any, Any]:
-        """The action as it reaches the drives; the state holds the policy's own and the actions that wait."""
-        own, waiting = state or (None, ())
-        action, own = self.policy.predict(observation, own, episode_start, deterministic)
-        action = np.array(action, np.float32)
-        action[:, 0] = np.clip(self.factor * action[:, 0], -1.0, 1.0)
-        waiting = (*(waiting or [np.zeros_like(action)] * self.late), action)
-        return waiting[0], (own, waiting[1:])
+        """Shares of the drives' ranges, and the agent's memory."""
+        seen = decode(observation, *self.agent.ranges)
+        pull, heater, state = self.agent.step(seen, self.agent.at_rest(seen) if state is None else state)
+        return np.stack([pull / self.agent.v_0, heater / self.agent.heater_range], axis=-1), state
 
 
-def policy_and_config(name: str, scenario: str, hours: float) -> tuple[Any, Config]:
-    """A controller or a shipped agent, and the environment that it acts in."""
-    if name in shipped_names():
-        agent = load(name)
-        config = make_config(scenario, horizon=hours * HOUR, **agent.settings)
-        return load(name, config), config
-    config = make_config(scenario, observation="measured", action="direct", horizon=hours * HOUR)
-    return make_controller(name, config), config
+@dataclass(frozen=True)
+class Altered:
+    """A policy of setpoints whose pull has another effect, and whose setpoints act late; it reads what it asked for."""
+
+    policy: Any
+    config: Config
+    factor: float = 1.0
+    late: int = 0
+    """Number of control intervals."""
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Any, Any]:
+        """Setpoints as they act; the state holds the policy's own, those last asked for, their mean, those in wait."""
+        seen = np.array(observation, np.float64)
+        own, asked, mean, waiting = state or (None, np.zeros((len(seen), 2)), np.zeros(len(seen)), None)
+        mean = moved_mean(mean, asked[:, 0], self.config.control_interval)
+        ranges = self.config.ranges
+        of = [PULL, HEATER, MEAN]
+        seen[:, of] = np.column_stack([asked, mean]) * [*ranges, ranges[0]] / scales(MEASURED, *ranges)[of]
+        action, own = self.policy.predict(seen, own, episode_start, deterministic)
+        asked = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
+        acting = np.clip(asked * [self.factor, 1.0], -1.0, 1.0).astype(np.float32)
+        waiting = (*(waiting or [np.zeros_like(acting)] * self.late), acting)
+        return waiting[0], (own, asked, mean, waiting[1:])
+
+
+def policy_and_config(name: str, hours: float) -> tuple[Any, Config]:
+    """A controller or a shipped agent, whose actions are setpoints, and the environment that it acts in."""
+    config = make_config(SCENARIO.name, observation="measured", action="direct", horizon=hours * HOUR)
+    return (Setpoints(Agent(load(name), config)) if name in shipped_names() else make_controller(name, config)), config
 
 
 def largest(grid: Sequence[float], holds: Callable[[float], bool]) -> float | None:
@@ -84,7 +112,7 @@ def robustness(policy: Any, config: Config, crystals: int) -> tuple[float, float
     """Largest factor on the pull's effect, smallest one, and longest extra delay [s]; 1 or 0 where none holds."""
 
     def error(**change: Any) -> float:
-        found = metrics(rollout(Altered(policy, **change), config, TEST_SEEDS[:crystals]))
+        found = metrics(rollout(Altered(policy, config, **change), config, TEST_SEEDS[:crystals]))
         return float(found.rmse_mm.mean()) if not found.failure_rate.any() else np.inf
 
     most = WORSE * error()
@@ -100,26 +128,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = StudyParser("robustness", __doc__, "results/robustness")
     parser.add_argument("controllers", nargs="*", help=f"names ({', '.join(CONTROLLERS)})")
-    parser.add_scenario("%(default)s", "randomized")
     parser.add_argument("--crystals", type=between(1, 500), default=50, help="number of test crystals (%(default)s)")
     parser.add_argument("--hours", type=float, default=1.5, help="length of a crystal [h] (%(default)s)")
     return parser.run(_main, arguments)
 
 
 def _main(given: argparse.Namespace) -> None:
-    rows = []
+    rows, interval = [], 0.0
     for name in given.controllers or CONTROLLERS:
-        policy, config = policy_and_config(name, given.scenario, given.hours)
-        up, down, late = robustness(policy, config, given.crystals)
-        rows.append((name, f"{up:g}", f"{down:.2g}", f"{late:g}"))
+        policy, config = policy_and_config(name, given.hours)
+        interval = config.control_interval
+        rows.append((name, *robustness(policy, config, given.crystals)))
         print(*rows[-1], flush=True)
-    heads = "controller", "pull's effect up to", "down to", "extra delay [s]"
-    about = (
-        f"{given.crystals} test crystals of `{given.scenario}`, {given.hours:g} h each: none is lost, and the mean "
-        f"radius error is at most {WORSE:g} times as large. The grid ends at {FACTORS[-1]:g}, its inverse "
-        f"and {SAMPLES[-1]} control intervals."
+    ends = FACTORS[-1], 1.0 / FACTORS[-1], SAMPLES[-1] * interval
+    lines = [(name, *map(beyond, figures, ends)) for name, *figures in rows]
+    about = f"{given.crystals} test crystals of `{SCENARIO.name}`, {given.hours:g} h each. {ROBUSTNESS_MEANS}"
+    text, table = (
+        f"# Robustness, measured\n\n{about}\n\n{markdown(('controller', *ROBUSTNESS), lines)}\n",
+        io.StringIO(),
     )
-    write_files({given.out / "table.md": f"# Robustness, measured\n\n{about}\n\n{markdown(heads, rows)}\n".encode()})
+    csv.writer(table, lineterminator="\n").writerows(
+        [("controller", *ROBUSTNESS, "contract"), *((*line, contract_hash([SCENARIO])) for line in lines)]
+    )
+    write_files({given.out / "table.md": text.encode(), given.out / "robustness.csv": table.getvalue().encode()})
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import csv
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Self
@@ -197,6 +197,8 @@ class Benchmark:
     """Logged signals of each scenario's first crystal by scenario and controller, of the first training seed."""
     earlier_bound: pd.DataFrame
     """Rows of :data:`BOUND` from an earlier run, of scenarios where gaps are measured from them."""
+    robustness: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Measured robustness by controller, from an earlier study."""
 
     @classmethod
     def of(
@@ -206,13 +208,14 @@ class Benchmark:
         episodes: pd.DataFrame,
         signals: Mapping[tuple[str, str], Any],
         earlier_bound: pd.DataFrame | None = None,
+        robustness: Mapping[str, tuple[str, ...]] = {},
     ) -> Self:
         """Estimate everything of these episodes."""
         able = [each for each in contenders if not each.bound]
         agents, rivals = ([each.name for each in able if each.learned == learned] for learned in (True, False))
         earlier = episodes.iloc[:0] if earlier_bound is None else earlier_bound
         frame = estimates(episodes, agents, rivals, earlier)
-        return cls(tuple(cases), tuple(contenders), episodes, frame, signals, earlier)
+        return cls(tuple(cases), tuple(contenders), episodes, frame, signals, earlier, robustness)
 
     def only(self, cases: Sequence[Case] | None = None, contenders: Sequence[Contender] | None = None) -> Self:
         """Return the same benchmark with some of its scenarios or controllers."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cz_gym.baselines.fallback import fallback
-from cz_gym.baselines.margins import EXPLAINED, HEADS, shown
+from cz_gym.baselines.margins import HEADS
 from cz_gym.baselines.pid import StandardPID
 from cz_gym.baselines.tuned_controllers import LQGS, PIDS
 from cz_gym.body.process import STATES, linearise, radius_model
@@ -32,6 +32,7 @@ from cz_gym.puller.file import PullerFile, defaults_of, doubts, find_puller, val
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import CELSIUS, HOUR, KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.tools.posterior import explained, shown
 from cz_gym.tools.report.tables import markdown
 
 
@@ -114,7 +115,7 @@ def margins(puller: PullerFile) -> str:
     """Margins of the controllers that are searched for a puller, as they are designed for it now, as a table."""
     config = make_config(RANDOMIZED, observation="measured", action="direct", puller=puller)
     rows = [(each.name, *row) for each in (*PIDS, *LQGS) if each.near for row in shown(each.make(config), config)]
-    return f"{markdown(('controller', *HEADS), rows)}\n\n{EXPLAINED}"
+    return f"{markdown(('controller', *HEADS), rows)}\n\n{explained(puller)}"
 
 
 CRYSTALS = 20

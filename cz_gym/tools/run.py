@@ -5,6 +5,7 @@ The rows of slow controllers are kept in files, one a controller and scenario, w
 those that are there do not run again. An earlier bound is rows of another benchmark's table.
 """
 
+import csv
 import hashlib
 import json
 import math
@@ -83,7 +84,8 @@ def run(
     table = pd.concat([done[number][0] for number in range(len(tasks))], ignore_index=True)
     signals = {(case.name, each.name): done[number][1] for number, (each, case, *_) in enumerate(tasks)}
     earlier = earlier_bound(bounds, table, cases, contenders) if bounds else None
-    return Benchmark.of(cases, contenders, table, signals, earlier)
+    robust = earlier_robustness(bounds.parent / "robustness" / "robustness.csv") if bounds else {}
+    return Benchmark.of(cases, contenders, table, signals, earlier, robust)
 
 
 def run_task(task: Task, progress: Callable[[int], Any] = lambda steps: None) -> Rows:
@@ -217,6 +219,15 @@ def earlier_bound(
         if bound["seed"].tolist() == list(case.seeds(len(bound))) and all(_agree(now[n], then[n]) for n in both):
             found.append(bound)
     return pd.concat(found) if found else None
+
+
+def earlier_robustness(file: Path) -> dict[str, tuple[str, ...]]:
+    """Return the figures of ``studies.robustness`` by controller; none of another contract."""
+    if not file.is_file():
+        return {}
+    _, *lines = csv.reader(file.read_text("utf-8").splitlines())
+    contract = contract_hash([find_case("randomized", TASKS["Cz-v0"].cases)])
+    return {name: tuple(figures) for name, *figures, measured_on in lines if measured_on == contract}
 
 
 def _agree(now: pd.DataFrame, then: pd.DataFrame) -> bool:

@@ -203,7 +203,8 @@ def puller_text(identified: Identified, source: str, name: str) -> str:
         changed = value_of(puller, quantity) != value_of(start, quantity)
         body, mark = tables.setdefault(quantity.table, []), marks.get(quantity.symbol, "")
         _write_number(body, quantity.key, values.get(quantity.key), mark, changed, quantity.key in defaults)
-    text = _joined(tables, source, name if shipped else start.name)
+    known = identified.posterior.lines() if identified.posterior and not identified.misfits else []
+    text = _joined(tables, source, name if shipped else start.name, known)
     return text if _same(text, puller.hash) else to_toml(puller)
 
 
@@ -253,11 +254,11 @@ def _tables(lines: list[str]) -> dict[str, list[str]]:
     return tables
 
 
-def _joined(tables: dict[str, list[str]], source: str, name: str) -> str:
+def _joined(tables: dict[str, list[str]], source: str, name: str, known: list[str]) -> str:
     top = [line for line in tables[""] if not line.startswith("name")]
     at = next((k for k, line in enumerate(top) if line.startswith("format")), -1) + 1
     top.insert(at, f"name = {json.dumps(name, ensure_ascii=False)}")
-    parts = [f"# {MARK}from {source}; numbers without a mark are as the start file has them.", *top]
+    parts = [f"# {MARK}from {source}; numbers without a mark are as the start file has them.", *known, *top]
     for table, body in tables.items():
         parts += ["", f"[{table}]", *body] if table and body else []
     return "\n".join(parts) + "\n"

@@ -16,6 +16,7 @@ from cz_gym.physics.parameters import Parameters
 from cz_gym.puller.file import DEFAULT, PullerFile
 from cz_gym.support.errors import CzError, unknown_name_message
 from cz_gym.support.units import KILO, MM
+from cz_gym.tools.posterior import Posterior
 
 from .log import Floats, Log, join_logs, prepare, shift_drives
 from .model import (
@@ -117,6 +118,8 @@ class Identified:
     """Names of those that were told, in place of handbooks' and the usual ones."""
     misfits: tuple[str, ...] = ()
     """Reasons why the model does not fit the log, in words; empty if it does."""
+    posterior: Posterior | None = None
+    """Posterior of parameters and lags; that of a parameter whose drive was not excited is its prior."""
 
     @property
     def log(self) -> Log:
@@ -211,10 +214,11 @@ def identify(
     gain = _ring_gain(rows, model, best, sd) if pull >= 1.0 else (1.0, np.inf)
     result = Identified(start, told, noise, (pull, heater), errors, best.out, tuple(rows), best.settled, gain, sds)
     result = replace(result, told_sds=tuple(prior_sd or ()))
+    known = _posterior(model, best, (*HEATER, *PULL, *(LAGS if result.delayed else ())), sds)
     away = dict(zip(model.names, (best.theta - model.mean) / sd, strict=True))
     if reasons := misfits(result, model.puller(best.theta + 0j), away):
         told, noise = (tuple(e._replace(trusted=False) for e in each) for each in (told, noise))
-    return replace(result, estimates=told, noise=noise, misfits=reasons)
+    return replace(result, estimates=told, noise=noise, misfits=reasons, posterior=known)
 
 
 def prior_sds(given: Mapping[str, float]) -> dict[str, float]:
@@ -254,6 +258,17 @@ class Maximum(NamedTuple):
     def sd(self) -> Floats:
         """Standard deviations of the free numbers."""
         return np.sqrt(np.diag(self.covariance))
+
+
+def _posterior(model: Model, best: Maximum, of: Sequence[str], sds: Mapping[str, float]) -> Posterior:
+    """The posterior of a puller's numbers. WIDER makes none less known than before; lam is each crystal's own."""
+    names = [name for name in of if name != "lam"]
+    covariance = np.diag([sds[name] ** 2 for name in names])
+    at = [j for j, name in enumerate(names) if name in model.names]
+    free = [model.names.index(names[j]) for j in at]
+    shares = np.minimum(np.array([sds[names[j]] for j in at]) / best.sd[free], 1.0)
+    covariance[np.ix_(at, at)] = best.covariance[np.ix_(free, free)] * np.outer(shares, shares)
+    return Posterior(tuple(names), covariance)
 
 
 def _delay(best: Maximum, model: Model) -> Floats:

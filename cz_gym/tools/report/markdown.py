@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.baselines.margins import EXPLAINED as BEARS
-from cz_gym.baselines.margins import HEADS, shown
+from cz_gym.baselines.margins import HEADS
 from cz_gym.evaluation.metrics import OUTSIDE
 from cz_gym.evaluation.protocol import BOUND, REFERENCE, Case, Contender
 from cz_gym.puller.file import DEFAULT
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import KILO, MM, PERCENT
 from cz_gym.tools.episodes import Benchmark
+from cz_gym.tools.posterior import explained, shown
 from cz_gym.tools.report.task_records import BODY_DRIVES, contract_hash, task_of
 
 from . import tables
@@ -228,7 +228,8 @@ def markdown(benchmark: Benchmark, command: str, figures: Iterable[str]) -> str:
         summary(benchmark),
         *(f"![{name.partition('.')[0]}]({name})" for name in figures if name != "result.svg"),
         "## Who took part",
-        tables.markdown(tables.WHO, tables.who(benchmark.contenders), rule="---"),
+        tables.markdown(*tables.who(benchmark), rule="---"),
+        *([tables.ROBUSTNESS_MEANS] if benchmark.robustness else []),
         *(part for case in benchmark.cases for part in _scenario(benchmark, case)),
         "## How it was made",
         f"`{command}`; versions, hashes and seeds stand in benchmark.json.",
@@ -247,7 +248,8 @@ def _for_a_grower(benchmark: Benchmark) -> list[str]:
     for case in benchmark.cases:
         parts += [f"**{case.name}**: {case.meaning}.", tables.markdown(*outcome(benchmark, case))]
     agents = any(each.learned for each in benchmark.contenders)
-    parts += [EXPLAINED, *warnings(benchmark), tables.markdown(MARGINS, margins(benchmark)), BEARS]
+    parts += [EXPLAINED, *warnings(benchmark), tables.markdown(MARGINS, margins(benchmark))]
+    parts.append(explained(benchmark.cases[0].puller))
     return [*parts, *(_verdict(benchmark) if agents else [])]
 
 

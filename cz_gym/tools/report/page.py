@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from cz_gym.baselines.margins import EXPLAINED as BEARS
 from cz_gym.env import CzEnv
 from cz_gym.evaluation.plots import DRIVE, INK, RING, TRUE, lighter
 from cz_gym.evaluation.protocol import REFERENCE, Case
 from cz_gym.evaluation.rollout import Floats
 from cz_gym.support.units import HOUR, MINUTE, MM
 from cz_gym.tools.episodes import Benchmark
+from cz_gym.tools.posterior import explained
 from cz_gym.tools.report.task_records import task_of
 
 from . import markdown, tables, vector
@@ -128,7 +128,8 @@ def page(benchmark: Benchmark, command: str) -> str:
         "tables": "\n".join(_metrics(benchmark, each, is_open=each is case) for each in benchmark.cases),
         "result": vector.result(benchmark),
         "pareto": vector.pareto(benchmark),
-        "controllers": _table(tables.WHO, tables.who(contenders), "words"),
+        "controllers": _table(*tables.who(benchmark), "words")
+        + (f'<p class="note">{escape(tables.ROBUSTNESS_MEANS)}</p>' if benchmark.robustness else ""),
         "command": escape(command),
     }
     if case.tolerance is not None:
@@ -147,7 +148,7 @@ def _for_a_grower(benchmark: Benchmark) -> dict[str, str]:
         "best_note": escape(" ".join((markdown.EXPLAINED, *markdown.warnings(benchmark)))),
         "question": "What the loops bear",
         "scenarios": _table(markdown.MARGINS, markdown.margins(benchmark)),
-        "answer_note": escape(BEARS),
+        "answer_note": escape(explained(benchmark.cases[0].puller)),
     }
 
 

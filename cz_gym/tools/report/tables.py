@@ -64,6 +64,13 @@ COMPARISON = (
 """Columns that compare with the reference on the same crystals, and gaps."""
 WHO = "controller", "reads", "what it is", "training seeds"
 """Heads of :func:`who`."""
+ROBUSTNESS = "pull's effect up to", "down to", "extra delay [s]"
+ROBUSTNESS_MEANS = (
+    "Robustness is measured: the pull moves the crystal that many times as much as asked for (1 is exact), or both "
+    "drives act that much later, no crystal is lost, and the mean radius error at most doubles; readings show what was "
+    "asked for. Marks for at least and at most stand where the grid ends."
+)
+"""Meaning of :data:`ROBUSTNESS`."""
 
 
 def comparison(benchmark: "Benchmark", case: Case) -> tuple[Column, ...]:
@@ -87,12 +94,22 @@ def rows(benchmark: "Benchmark", case: Case, columns: Sequence[Column]) -> list[
     return [(label(benchmark, case, name), *(column.of(benchmark, case, name) for column in columns)) for name in names]
 
 
-def who(contenders: Sequence[Contender]) -> list[tuple[str, ...]]:
-    """Return one row a contender: what it is, reads and was trained with."""
-    return [
-        (each.name, each.observation, each.meaning, ", ".join(map(str, each.training_seeds)) or NOTHING)
-        for each in contenders
+def who(benchmark: "Benchmark") -> Table:
+    """Return heads, and one row a contender: what it is, reads and was trained with, and its robustness if measured."""
+    found = benchmark.robustness
+    rows = [
+        (
+            *(each.name, each.observation, each.meaning, ", ".join(map(str, each.training_seeds)) or NOTHING),
+            *((NOTHING,) * len(ROBUSTNESS) if each.own else found.get(each.name, (NOTHING,) * len(ROBUSTNESS))),
+        )
+        for each in benchmark.contenders
     ]
+    return ((*WHO, *ROBUSTNESS), rows) if found else (WHO, [row[: len(WHO)] for row in rows])
+
+
+def beyond(value: float, end: float) -> str:
+    """Return a figure of a search on a grid, marked if it is the grid's end."""
+    return ("" if value != end else "≥ " if end > 1.0 else "≤ ") + f"{value:.3g}"
 
 
 def markdown(heads: Iterable[str], rows: Iterable[Iterable[str]], rule: str = "--:") -> str:

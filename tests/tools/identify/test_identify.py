@@ -3,12 +3,15 @@
 import re
 import shutil
 from dataclasses import replace
+from itertools import islice
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from cz_gym import CzEnv, Parameters, make_puller
+from cz_gym.baselines.analysis import Lags as AllLags
+from cz_gym.baselines.margins import worst_margins
 from cz_gym.baselines.policy import OpenLoop
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Reference
@@ -26,6 +29,7 @@ from cz_gym.tools.identify.estimate import HEATER, LAGS, PULL, coloured, misfits
 from cz_gym.tools.identify.log import Log, prepare, shift_drives
 from cz_gym.tools.identify.model import LAM, Lags, Model, NoiseLevels, heating, predict, sensitivities
 from cz_gym.tools.identify.moves import CHIPS, SEQUENCE, measure_excitation
+from cz_gym.tools.posterior import Posterior, explained, quantiles
 from cz_gym.tools.registry import make_controller
 from examples import identify as example
 from studies import identify as study
@@ -333,6 +337,31 @@ def test_the_file_keeps_what_was_known_and_says_where_each_number_is_from(found,
     assert re.search(r"\[melt\]\nfluctuation_sd_K = \[.*\] # identify: estimated, 95 % intervals: fast .*, slow", text)
     again = puller_text(replace(found, start=mine), "log.csv", "my")
     assert again.count("graphite, 30 kg; identify: ") == 1
+
+
+def test_margins_are_over_the_posterior_that_the_file_holds(found, tmp_path, capsys):
+    (tmp_path / "my.toml").write_text(puller_text(found, "log.csv", "my"))
+    mine = read_puller(tmp_path / "my.toml")
+    read, told = Posterior.of(mine), found.posterior
+    assert (read.names, Posterior.of(found.puller)) == (told.names, None)
+    np.testing.assert_allclose(read.covariance, told.covariance, atol=1e-3 * np.diag(told.covariance).max())
+    for e in (e for e in found.estimates if e.informed and e.name in Parameters._fields):
+        sd = np.sqrt(told.covariance[told.names.index(e.name), told.names.index(e.name)])
+        assert np.log(e.high / e.low) == pytest.approx(2 * 1.96 * sd)
+    lags = AllLags(5.0, 4.0, 3.0, 2.0)
+    draws = [q.C_1 / mine.parameters.C_1 for q, _ in islice(read.draws(mine, lags), 2000)]
+    at = read.names.index("C_1")
+    assert np.std(np.log(draws)) == pytest.approx(np.sqrt(read.covariance[at, at]), rel=0.1)
+    sure = Posterior(("C_1", "heater_dead_time"), np.diag([1e-10, 1e-10]))
+    config = make_config("randomized", observation="measured", action="direct", puller=mine)
+    lqg = make_controller("lqg", config)
+    np.testing.assert_allclose(quantiles(lqg, config, sure, 4), worst_margins(lqg, config, 200), rtol=1e-3)
+    late = Posterior(("heater_dead_time",), np.array([[900.0]]))
+    assert quantiles(lqg, config, late, 40).heater.delay < quantiles(lqg, config, sure, 4).heater.delay
+    assert "drawn from the identification in its file" in explained(mine)
+    (tmp_path / "my.toml").write_text("format = 1\n# identify: posterior C_1 x\n")
+    with pytest.raises(CzError, match="damaged: identify the puller again"):
+        Posterior.of(mine)
 
 
 def test_a_model_that_does_not_fit_is_no_result(logs, found, tmp_path, monkeypatch, capsys):
