@@ -30,7 +30,7 @@ SLOW = {
 }  # fmt: skip
 """Quirks of slow drives: 1 kW/min in steps of 50 W, 0.3 mm/min, 0.2 mm/min in a minute."""
 ODD = {
-    "heater_lag": 45.0, "heater_dead": 6.0, "pyrometer_lag": 20.0, "pyrometer_step": 0.5, "pull_scale": 0.98,
+    "heater_lag": 45.0, "heater_dead": 6.0, "pyrometer_lag": 20.0, "pyrometer_step": 0.2, "pull_scale": 0.98,
     "pull_dead": 0.01, "ripple": 0.1, "deep_melt": 2e3, "warming": 5.0 / 3600.0, "bursts": 0.5,
 }  # fmt: skip
 """Quirks of another structure than any puller file has."""

@@ -15,13 +15,10 @@ from cz_gym.baselines.margins import worst_margins
 from cz_gym.baselines.policy import OpenLoop
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Reference
-from cz_gym.puller.file import DEFAULT, PullerFile, find_puller, read_puller, write_puller
+from cz_gym.puller.file import DEFAULT, find_puller, read_puller, write_puller
 from cz_gym.spaces import HEATER_RANGE, MEASURED, TargetEnv, decode
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import MM
-from cz_gym.tools.export.block import OUTPUTS
-from cz_gym.tools.export.controllers import make_block
-from cz_gym.tools.export.text import CompiledBlock
 from cz_gym.tools.identify import Excited, command, identify, read_log, record_log
 from cz_gym.tools.identify import model as model_of_log
 from cz_gym.tools.identify.command import puller_text
@@ -33,8 +30,9 @@ from cz_gym.tools.posterior import Posterior, explained, quantiles
 from cz_gym.tools.registry import make_controller
 from examples import identify as example
 from studies import identify as study
-from studies.identify import draw, errors_of_start, write_logs
+from studies.identify import draw, write_logs
 from tests.foreign_puller import SLOW, ZONE, ForeignPuller, Operator, drive, write_log
+from tests.other_machine import MACHINE, block_for, file_of, hold
 from tests.tools.identify.conftest import OWN, TRUTH
 
 
@@ -433,41 +431,11 @@ def test_the_study_identifies_pullers_that_nobody_knows(tmp_path, capsys, monkey
 
 LAG = 10.0
 """The heater's lag, which the start file does not know [s]."""
-MACHINE = ZONE | {name: ZONE[name] * factor for name, factor in errors_of_start(np.random.default_rng([11, 1])).items()}
-"""The machine's hot zone, which the start file has wrong."""
 
 
-def file_of(zone, **delays):
-    """A puller file of a machine's numbers, with its drives and sensors."""
-    numbers = {name: value for name, value in zone.items() if name != "lam"}
-    return PullerFile(
-        "machine", Parameters()._replace(**numbers), control_interval=2.0, latency=0.0,
-        pull_window=SLOW["pull_window"] / 6e4, pull_slew=SLOW["pull_slew"] / 6e4, heater_slew=SLOW["heater_slew"],
-        heater_step=SLOW["heater_step"], camera_noise=(5e-5, 5e-5), pyrometer_noise=(0.1, 0.1), **delays,
-    )  # fmt: skip
-
-
-def hold(file):
-    """Root mean square radius error [mm] of the machine after half an hour, under the block exported for a file.
-
-    As an operator does, nominal power, temperature and ring are trimmed to the machine's.
-    """
-    config = make_config("randomized", observation="measured", action="direct", puller=file)
-    block, puller = CompiledBlock(make_block("lqg", config)), ForeignPuller(MACHINE, 100, **SLOW, heater_lag=LAG)
-    memory, power = block.start(1), puller.power_0 / 1e3
-    trims = {
-        "ring_bias_mm": 1e3 * puller.ring_bias, "nominal_T_1_K": puller.T_1_0, "nominal_heater_power_kW": power,
-        "oldest_reading_s": 20.0, "heater_power_min_kW": power - 10.0, "heater_power_max_kW": power + 10.0,
-    }  # fmt: skip
-
-    def setpoints(seen):
-        nonlocal memory
-        outputs, memory = block.run({**seen, **trims, "automatic": 1.0}, memory)
-        return {port.name: float(outputs[port.name][0]) for port in OUTPUTS}
-
-    rows = drive(puller, setpoints)
-    assert not puller.lost
-    return np.sqrt(np.mean([(row["true_radius_mm"] - row["r_ref_mm"]) ** 2 for row in rows if row["time_s"] >= 1800.0]))
+def held_by(file):
+    """Error of a machine under the block exported for a file [mm]."""
+    return hold(block_for("lqg", file), ForeignPuller(MACHINE, 100, **SLOW, heater_lag=LAG))
 
 
 @pytest.mark.slow
@@ -478,4 +446,4 @@ def test_a_machine_by_somebody_else_is_logged_identified_designed_for_and_driven
     log = write_log(tmp_path / "log.csv", drive(puller, Operator(puller, 1).setpoints), 1, **historian)
     identified = identify(read_log(log), file_of(ZONE))
     assert not identified.misfits
-    assert hold(identified.puller) < 2.0 * hold(file_of(MACHINE, heater_lag=(LAG, LAG)))
+    assert held_by(identified.puller) < 2.0 * held_by(file_of(MACHINE, heater_lag=(LAG, LAG)))
