@@ -62,9 +62,9 @@ MEANT = "on", "off", "true", "false"
 """Words that stand for a number, so that they are not missing."""
 WORDS = 0.2
 """Largest share of a column's fields that may be words in place of numbers, as historians write them."""
-GOOD = "good", "true", "yes", "y", "ok", "valid", "t"
-BAD = "bad", "false", "no", "n", "invalid", "f", "uncertain", "questionable", "error", "fail"
-"""Words of a quality; what is uncertain is not valid."""
+GOOD = "good|g|true|t|yes|y|ok|valid|gut|ja|wahr|bon|oui|vrai|vero|verdadero"
+BAD = "bad|b|false|f|no|n|not|invalid|uncertain|questionable|error|fail|schlecht|nein|falsch|mauvais|non|faux|falso"
+"""Words of a quality; a bad one counts more, and what is uncertain is not valid."""
 TOP = 100
 """Lines of a file among which its columns are named."""
 
@@ -91,9 +91,9 @@ def read_fields(path: Path, wanted: set[str], notes: dict[str, int]) -> Any:
             return len(wanted & set(fields)), len(fields)
 
         top, separator = max(places, key=matches, default=(0, ","))
-        names = _fields(lines[top], separator)
-        whole, rows = _without_nuls(lines[top:], len(names), separator)
-        notes["rows are lost in NUL bytes, as after a power failure"] = len(lines) - top - len(whole)
+        names = _fields(lines[top].rpartition("\0")[2].lstrip("# "), separator)
+        whole, rows, lost = _sound_lines(lines[top:], len(names), separator)
+        notes["rows are lost in NUL bytes, as after a power failure"] = lost
         asked: Any = {"dtype": str, "keep_default_na": False, "skip_blank_lines": False, "index_col": False}
         text = "\n".join(whole)
         table = pandas.read_csv(io.StringIO(text), sep=separator, lineterminator="\n", **asked)
@@ -123,15 +123,20 @@ def _decoded(raw: bytes) -> str:
     return text if "\n" in text else text.replace("\r", "\n")
 
 
-def _without_nuls(lines: Sequence[str], count: int, separator: str) -> tuple[list[str], list[int]]:
-    """Leave out what NUL bytes have cut: a row counts if all its fields stand behind them. Returns rows and places."""
-    whole, places = [], []
+def _sound_lines(lines: Sequence[str], count: int, separator: str) -> tuple[list[str], list[int], int]:
+    """Leave out blank lines, the names of the columns again, and what NUL bytes have cut.
+
+    A row counts if all its fields stand behind the NUL bytes. Returns rows, their places, and how many were cut.
+    """
+    whole, places, lost = [], [], 0
     for place, line in enumerate(lines):
         rest = line.rpartition("\0")[2]
-        if rest is line or "\0" not in line or len(_fields(rest, separator)) == count:
+        if "\0" in line and len(_fields(rest, separator)) != count:
+            lost += 1
+        elif rest.strip() and (not place or line != lines[0]):
             whole.append(rest)
             places.append(place)
-    return whole, places
+    return whole, places, lost
 
 
 def _fields(line: str, separator: str) -> list[str]:
@@ -170,14 +175,14 @@ def parse_times(column: Any, unit: str, notes: dict[str, int]) -> Any:
         row = (~absent).idxmax() if len(text) else 0
         raise CzError(
             f"row {row}: {column.name} = {text.get(row, '')!r} is no time in {unit}"
-            f"{_units_meant(text[~absent], str(column.name))}"
+            f"{_units_meant(text[~absent], str(column.name), unit)}"
         )
     first, end = int(good[0]), int(good[-1]) + 1
     notes["rows above or below the table have no time"] = first + len(text) - end
     inside = times.iloc[first:end]
     if inside.isna().any():
         row = inside.isna().idxmax()
-        hint = "" if absent[row] else _units_meant(text.iloc[first:end][~absent], str(column.name))
+        hint = "" if absent[row] else _units_meant(text.iloc[first:end][~absent], str(column.name), unit)
         what = "the time is missing" if absent[row] else f"{column.name} = {text[row]!r} is no time in {unit}{hint}"
         raise CzError(f"row {row}: {what}")
     if unit in DATED:
@@ -216,8 +221,10 @@ def _fit_unit(text: Any, unit: str) -> tuple[str, bool, float] | None:
     return None
 
 
-def _units_meant(text: Any, name: str) -> str:
-    """Hint at the units in which rows all over the column are times that grow as a log's; empty if there is none."""
+def _units_meant(text: Any, name: str, given: str) -> str:
+    """Hint at the units in which rows all over the column are times that grow as a log's; empty if there is none, or
+    the given one is among them.
+    """
     if len(text) < 2:
         return ""
     fitting = list(filter(None, (_fit_unit(text, unit) for unit in TIME)))
@@ -228,7 +235,7 @@ def _units_meant(text: Any, name: str) -> str:
         units = [unit for unit in units if unit not in spans]
     if {"dmy", "mdy"} <= set(units) and "." in text.iloc[0][:6]:
         units.remove("mdy")  # nobody writes the month first between dots
-    if not units:
+    if not units or given in units:
         return ""
     return f": did you mean {' or '.join(f'time_s={name}:{unit}' for unit in units)}?"
 
@@ -320,7 +327,7 @@ def _seconds(parts: Any, most: float = 24.0) -> Any:
 
 def _plain_numbers(text: Any) -> Any:
     """Write numbers with a decimal point and nothing between thousands; of two signs in a field the last is decimal."""
-    text = text.str.replace(r"(?<=\d)[\s'](?=\d)", "", regex=True)
+    text = text.str.replace(r"(?<=\d)[\s'](?=\d)", "", regex=True).str.replace("\N{MINUS SIGN}", "-", regex=False)
     both = text.str.extract(r"([.,]).*([.,])")
     both = both[both[0] != both[1]].dropna()
     if len(both):
@@ -338,7 +345,7 @@ def parse_numbers(column: Any, name: str, notes: dict[str, int]) -> Any:
     absent = text.str.lower().isin(ABSENT)
     numbers = pandas.to_numeric(_plain_numbers(text).mask(absent), errors="coerce").astype(float)
     wrong = numbers.isna() & ~absent
-    words = wrong & ~text.str.match(r"[-+]?[.,]?\d") & ~text.str.lower().isin(MEANT)
+    words = wrong & ~text.str.match(r"[-+]?[.,]?\d(?!\.#)") & ~text.str.lower().isin(MEANT)
     if words.sum() <= WORDS * (~absent).sum():
         said = ", ".join(repr(str(word)) for word in dict.fromkeys(text[words]))
         notes[f"fields of {name} are words and count as missing: {said:.80}"] = int(words.sum())
@@ -358,7 +365,7 @@ def parse_quality(column: Any) -> Any:
     import pandas
 
     text = column.fillna("").str.strip()
-    low = text.str.lower().str.extract(r"^([^\W\d_]+)")[0]
+    says_good, says_bad = (text.str.contains(rf"(?i)(?<![^\W\d_])(?:{words})(?![^\W\d_])") for words in (GOOD, BAD))
     hexadecimal = text.where(text.str.fullmatch(r"0[xX][0-9a-fA-F]{1,8}"))
     numbers = pandas.to_numeric(_plain_numbers(text.mask(hexadecimal.notna())), errors="coerce").astype(float)
     numbers = numbers.fillna(hexadecimal.map(lambda code: int(code, 16), na_action="ignore").astype(float))
@@ -370,7 +377,7 @@ def parse_quality(column: Any) -> Any:
     else:
         good = codes >= 192.0
     quality = pandas.Series(np.where(np.isnan(codes), np.nan, good), text.index)
-    quality = quality.mask(low.isin(GOOD), 1.0).mask(low.isin(BAD), 0.0)
+    quality = quality.mask(quality.isna() & says_good, 1.0).mask(np.isnan(codes) & says_bad, 0.0)
     wrong = quality.isna() & ~text.str.lower().isin(ABSENT)
     if wrong.any():
         row = wrong.idxmax()
@@ -563,7 +570,9 @@ def _drop_bad_readings(grid: Any, present: npt.NDArray[np.int64], notes: dict[st
         grid[name] = grid[name].mask(outlier)
         notes[f"readings of {name} are missing"] = int(grid[name][present].isna().sum() - outlier.sum())
         if grid[name].count() < 0.3 * len(grid):
+            bad = invalid.sum() > 0.5 * len(grid) and name == "ring_radius_mm"
             hint = "; if blank means unchanged, say --hold" if grid[name].count() else ""
+            hint = f": the column valid calls {invalid.sum()} of them bad" if bad else hint
             raise CzError(f"{name} has only {grid[name].count()} good readings in {len(grid)} rows{hint}")
         if name not in DRIVES and grid[name].min() == grid[name].max():
             raise CzError(f"{name} is constant, so it tells nothing")

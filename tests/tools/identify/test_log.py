@@ -110,7 +110,8 @@ def test_gaps_repeats_jitter_and_outliers_are_counted(logs, rows, tmp_path):
         (lambda rows: rows.assign(**{" T_1_K": "1800"}), "two columns are called 'T_1_K'"),
         (lambda rows: rows[:300], "300 rows over 24.9 min are too short a log"),
         (every("T_1_K", "1800"), "T_1_K is constant"),
-        (every("valid", "0"), "ring_radius_mm has only 0 good readings in 2161 rows"),
+        (every("valid", "0"), "has only 0 good readings in 2161 rows: the column valid calls 2161 of them bad"),
+        (changed("time_s", "time"), "row 402: time_s = 'time' is no time in s"),
         (lambda rows: rows.rename(columns={"T_1_K": "T1"}), "; --column T_1_K=NAME:K"),
         (changed("time_s", "1e9", 2160), "nearly all of it are gaps"),
         (lambda rows: stamped(rows, "%m/%d/%Y %H:%M:%S", "2026-03-11T23:00:00"), "did you mean time_s=time_s:mdy?"),
@@ -272,7 +273,8 @@ def test_every_kind_of_table_is_the_same_log(kind, logs, rows, tmp_path):
     ("good", "bad"),
     [("1", "0"), ("1.0", "0.0"), ("TRUE", "FALSE"), ("true", "false"), ("Good", "Bad"), ("192", "0"), ("216", "24"),
      ("0", "2147483648"), ("0xC0", "0x18"), ("0x00000000", "0x80000000"), ("0x00000000", "0x40000000"), ("100", "0"),
-     ("Good [Local Override]", "Uncertain"), ("OK", "")],
+     ("Good [Local Override]", "Uncertain"), ("OK", ""), ("G", "B"), ("0 (Good)", "1 (Bad)"), ("Q_GOOD", "Q_BAD"),
+     ("192 - Good", "0 - Not Good"), ("WAHR", "FALSCH"), ("vrai", "faux"), ("0x1B0", "0x0F")],
 )  # fmt: skip
 def test_qualities_of_any_historian_leave_out_the_same_readings(good, bad, rows, tmp_path):
     log = read_log(write(tmp_path / "log.csv", graded(good, bad)(rows)))
@@ -280,18 +282,22 @@ def test_qualities_of_any_historian_leave_out_the_same_readings(good, bad, rows,
 
 
 def test_words_among_numbers_are_missing_and_counted(rows, tmp_path):
-    rows = rows.assign(T_1_K=rows.T_1_K.mask(rows.index.isin([100, 101, 102]), "Bad Input"))
+    rows = rows.assign(T_1_K=rows.T_1_K.mask(rows.index.isin([100, 101]), "Bad Input"))
+    rows = changed("T_1_K", "1.#QNAN0", 102)(rows)
     log = read_log(write(tmp_path / "log.csv", changed("heater_power_kW", "I/O Timeout", 200)(rows)))
     assert np.flatnonzero(np.isnan(log.T_1)).tolist() == [100, 101, 102]
     assert np.flatnonzero(log.unsure[:, 1]).tolist() == [200]
-    assert "3 fields of T_1_K are words and count as missing: 'Bad Input'" in log.notes
+    assert "3 fields of T_1_K are words and count as missing: 'Bad Input', '1.#QNAN0'" in log.notes
     assert "1 fields of heater_power_kW are words and count as missing: 'I/O Timeout'" in log.notes
 
 
 def test_nul_bytes_of_a_power_failure_cost_their_rows_alone(logs, tmp_path):
     lines, mine = logs[0].read_bytes().split(b"\n"), read_log(logs[0])
-    (tmp_path / "log.csv").write_bytes(logs[0].read_bytes() + b"\0" * 512)
-    assert read_log(tmp_path / "log.csv").notes == ()
+    for head, tail in ((b"", b"\0" * 512), (b"\0" * 100, b""), (b"# ", b"")):
+        (tmp_path / "log.csv").write_bytes(head + logs[0].read_bytes() + tail)
+        assert read_log(tmp_path / "log.csv").notes == ()
+    (tmp_path / "log.csv").write_bytes(b"\n\n".join([*lines[:400], lines[0], *lines[400:]]))
+    assert read_log(tmp_path / "log.csv").notes == ()  # blank lines, and names again
     lines[400] = lines[400][:20] + b"\0" * 40
     lines[900] = lines[899][:9] + b"\0" * 40 + lines[900]
     (tmp_path / "log.csv").write_bytes(b"\n".join(lines))
