@@ -93,10 +93,23 @@ class Altered:
         return waiting[0], (own, asked, mean, waiting[1:])
 
 
-def policy_and_config(name: str, hours: float) -> tuple[Any, Config]:
-    """A controller or a shipped agent, whose actions are setpoints, and the environment that it acts in."""
+def policy_and_config(name: str, scenario: str, hours: float) -> tuple[Any, Config]:
+    """A controller or a shipped agent, and the environment that it acts in."""
+    if name in shipped_names():
+        agent = load(name)
+        config = make_config(scenario, horizon=hours * HOUR, **agent.settings)
+        return load(name, config), config
+    config = make_config(scenario, observation="measured", action="direct", horizon=hours * HOUR)
+    return make_controller(name, config), config
+
+
+def with_setpoints(name: str, hours: float) -> tuple[Any, Config]:
+    """The same on :data:`SCENARIO`, with actions that are setpoints."""
+    policy, config = policy_and_config(name, SCENARIO.name, hours)
+    if name not in shipped_names():
+        return policy, config
     config = make_config(SCENARIO.name, observation="measured", action="direct", horizon=hours * HOUR)
-    return (Setpoints(Agent(load(name), config)) if name in shipped_names() else make_controller(name, config)), config
+    return Setpoints(Agent(policy, config)), config
 
 
 def largest(grid: Sequence[float], holds: Callable[[float], bool]) -> float | None:
@@ -136,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(given: argparse.Namespace) -> None:
     rows, interval = [], 0.0
     for name in given.controllers or CONTROLLERS:
-        policy, config = policy_and_config(name, given.hours)
+        policy, config = with_setpoints(name, given.hours)
         interval = config.control_interval
         rows.append((name, *robustness(policy, config, given.crystals)))
         print(*rows[-1], flush=True)

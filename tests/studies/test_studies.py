@@ -17,7 +17,6 @@ from PIL import Image
 
 from cz_gym import agents, make_puller
 from cz_gym.body.process import radius_model
-from cz_gym.config import make_config
 from cz_gym.evaluation import protocol
 from cz_gym.evaluation.protocol import CASES, TRAINING_SEEDS
 from cz_gym.evaluation.rollout import rollout
@@ -231,13 +230,10 @@ def test_robustness_is_the_largest_change_that_a_bisection_finds():
 @pytest.mark.parametrize("name", ["paper-tuned", "gradient", "ppo"])
 def test_an_altered_policy_scales_the_pull_and_holds_its_setpoints_back(name):
     """Unaltered it does what the policy does in its own environment, whose actions may be moves."""
-    policy, config = robustness.policy_and_config(name, 0.1)
+    policy, config = robustness.with_setpoints(name, 0.1)
     same = rollout(robustness.Altered(policy, config), config, [1, 2])
-    if name == "paper-tuned":
-        plain = rollout(policy, config, [1, 2])
-    else:
-        its = make_config("randomized", horizon=config.horizon, **agents.load(name).settings)
-        plain = rollout(agents.load(name, its), its, [1, 2])
+    own, its = robustness.policy_and_config(name, "randomized", 0.1)
+    plain = rollout(own, its, [1, 2])
     np.testing.assert_allclose(same.signals.v_p, plain.signals.v_p, rtol=1e-5)
     late = rollout(robustness.Altered(policy, config, factor=2.0, late=3), config, [1, 2]).signals
     v_0 = config.parameters.v_0
