@@ -225,19 +225,25 @@ def _units_meant(text: Any, name: str, given: str) -> str:
     """Hint at the units in which rows all over the column are times that grow as a log's; empty if there is none, or
     the given one is among them.
     """
-    if len(text) < 2:
+    fitting = list(filter(None, (_fit_unit(text, unit) for unit in TIME))) if len(text) > 1 else []
+    units = _likely_units(fitting, fitting != [] and "." in text.iloc[0][:6])
+    if not units or given in units:
         return ""
-    fitting = list(filter(None, (_fit_unit(text, unit) for unit in TIME)))
+    return f": did you mean {' or '.join(f'time_s={name}:{unit}' for unit in units)}?"
+
+
+def _likely_units(fitting: Sequence[tuple[str, bool, float]], dotted: bool) -> list[str]:
+    """The units in which rows are as far apart as a log's, if any are; of two orders of day and month the one in which
+    the log is much shorter. Between dots nobody writes the month first.
+    """
     best = [each for each in fitting if each[1]] or fitting
     units, spans = [unit for unit, *_ in best], {unit: span for unit, _, span in fitting if unit in ("dmy", "mdy")}
     units = [unit for unit in units if spans.get(unit, 0.0) <= 3.0 * min(spans.values(), default=0.0)]
     if "iso" in units:  # whose forms the other two read too
         units = [unit for unit in units if unit not in spans]
-    if {"dmy", "mdy"} <= set(units) and "." in text.iloc[0][:6]:
-        units.remove("mdy")  # nobody writes the month first between dots
-    if not units or given in units:
-        return ""
-    return f": did you mean {' or '.join(f'time_s={name}:{unit}' for unit in units)}?"
+    if {"dmy", "mdy"} <= set(units) and dotted:
+        units.remove("mdy")
+    return units
 
 
 MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
