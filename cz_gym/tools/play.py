@@ -26,8 +26,6 @@ from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import MINUTE
 
-from .registry import find_controller
-
 Action = npt.NDArray[np.float32]
 SIZE = (960, 720)
 """Width and height of the picture [px]."""
@@ -92,6 +90,8 @@ def score(config: Config, seed: int, actions: Sequence[Action], failed: bool) ->
     The controller is the paper's; on a whole crystal it is the one with the paper's compensator along the recipe. A run
     that the player left early ends there for both. A failed one counts to the horizon, as in the benchmark.
     """
+    from .registry import find_controller  # a window opens without it
+
     if not failed:
         config = replace(config, horizon=len(actions) * config.control_interval)
     direct = replace(config, action="direct")
