@@ -1,6 +1,7 @@
 """Benchmarks of a few made-up or quickly rolled out episodes."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,6 +15,7 @@ from cz_gym.evaluation.protocol import Case, Contender, find_case
 from cz_gym.evaluation.rollout import Rollout, rollout
 from cz_gym.tools.episodes import KEYS, Benchmark
 from cz_gym.tools.registry import find_controller
+from cz_gym.tools.report.tables import typical
 from cz_gym.tools.report.task_records import task_of
 
 NOMINAL_LQG = LQG(
@@ -61,13 +63,14 @@ def made(cases: Case | Sequence[Case], *samples: tuple[Contender, Mapping[str, A
 
 def rolled_out(case: Case, samples: Sequence[tuple[Contender, Rollout]]) -> Benchmark:
     """A benchmark of rollouts on one case; an agent's training seeds all have the same."""
-    names, parts, signals = names_of(task_of(case).metrics), [], {}
+    names, parts = names_of(task_of(case).metrics), []
     for who, run in samples:
         values = dict(zip(names, task_of(case).measure(run), strict=True))
         extra = {OUTSIDE: outside(run, case.tolerance)} if case.tolerance else {}
         parts.append(made_rows(case, who, values | extra, run.seeds))
-        signals[case.name, who.name] = run.episode(0)
-    return Benchmark.of([case], [who for who, _ in samples], pd.concat(parts, ignore_index=True), signals)
+    known = Benchmark.of([case], [who for who, _ in samples], pd.concat(parts, ignore_index=True), {})
+    drawn = typical(known, case)
+    return replace(known, signals={(case.name, who.name): run.episode(drawn) for who, run in samples})
 
 
 def joined(benchmarks: Sequence[Benchmark]) -> Benchmark:

@@ -101,7 +101,7 @@ STYLES = {
     "paper-filtered": _style(3, "sun"),
     "lqg": _style(6, "bar"),
     "lqg-quiet": _style(7, "sun"),
-    "lqg-at-0.02-adaptive": _style(3, "cross"),
+    "lqg-at-0.02-adaptive": _style(0, "cross"),
 }
 """Looks of those that figures show, of ``Cz-v0`` and of whole crystals; :func:`styles` has the others'."""
 
@@ -207,7 +207,7 @@ def draw(crystals: Sequence[DrawnCrystal], dt: float, title: str, tolerance: flo
     handles: list[Any] = [
         Line2D([], [], color=INK, lw=1.2, ls="--", label="reference"),
         Line2D([], [], color=RING, lw=1.2, alpha=0.4, label="ring as the camera reports it"),
-        Line2D([], [], color=DRIVE, lw=1.4, label="a drive's 5 min mean over single steps"),
+        Line2D([], [], color=DRIVE, lw=1.4, label="a drive's 5 min mean; pale: its single steps"),
     ]
     if tolerance:
         handles.insert(1, Patch(color=GREY, alpha=0.3, lw=0, label=f"diameter within ±{2.0 * tolerance / MM:g} mm"))

@@ -117,7 +117,8 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     if arguments.out is not None:  # a missing package is named before the work, not after it
         import matplotlib  # noqa: F401
     bounds = BOUNDS if task.has_bound and not arguments.puller else None
-    found = run(contenders, cases, arguments.episodes, CACHE, bounds, arguments.quiet, arguments.cluster)
+    how = {"quiet": arguments.quiet, "cluster": arguments.cluster, "pictures": arguments.out is not None}
+    found = run(contenders, cases, arguments.episodes, CACHE, bounds, **how)
     renewed = not smaller and arguments.out and arguments.out.resolve() == folder_of(arguments)
     write(arguments.out, arguments.json, found, command, PAGES if renewed else ())
     if not arguments.quiet:

@@ -194,7 +194,7 @@ class Benchmark:
     episodes: pd.DataFrame
     estimates: pd.DataFrame
     signals: Mapping[tuple[str, str], Any]
-    """Logged signals of each scenario's first crystal by scenario and controller, of the first training seed."""
+    """Logged signals of each scenario's typical crystal by scenario and controller, of the first training seed."""
     earlier_bound: pd.DataFrame
     """Rows of :data:`BOUND` from an earlier run, of scenarios where gaps are measured from them."""
     robustness: Mapping[str, tuple[str, ...]] = field(default_factory=dict)

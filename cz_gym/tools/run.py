@@ -11,6 +11,7 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,6 +31,7 @@ from cz_gym.support.errors import CzError, software
 from cz_gym.support.files import check_writable, name_file_in_errors, write_files
 
 from .episodes import CODE, CONTRACT, GAPS, KEYS, Benchmark, read_episodes, read_estimates, to_csv, values_of
+from .report.tables import NAMED, chosen, typical
 from .report.task_records import TASKS, TaskRecord, contract_hash, task_of
 
 PRINTED = 1e-4
@@ -45,7 +47,7 @@ PROCESSES = 8
 BLOCK = 10
 """Episodes that a slow controller runs at once, and that are cached together."""
 Rows = tuple[pd.DataFrame, Any]
-"""Rows of the table of episodes, and the signals of the first episode."""
+"""Rows of the table of episodes, and the signals of their first episode."""
 Task = tuple[Contender, Case, Sequence[int], Path]
 """One controller on one scenario, the picklable unit of work: with seeds, and the folder of slow controllers' rows."""
 
@@ -58,8 +60,11 @@ def run(
     bounds: Path | None = None,
     quiet: bool = False,
     cluster: str | None = None,
+    pictures: bool = False,
 ) -> Benchmark:
     """Roll every contender out on every case, with a progress bar unless ``quiet``, and estimate.
+
+    For ``pictures`` the typical crystal of each case is rolled out again, to know its signals.
 
     ``cached`` is the folder of slow controllers' rows, ``bounds`` that of an earlier benchmark whose bound serves a run
     without one. A long run is shared between processes, any run between the workers of a ``cluster``.
@@ -69,23 +74,54 @@ def run(
     tasks: list[Task] = [
         (each, case, episodes_of(each, case, episodes), cached.absolute()) for case in cases for each in contenders
     ]
-    steps = [case.config().steps * len(seeds) * max(len(each.trained), 1) for each, case, seeds, _ in tasks]
+    steps = sum(map(_steps, tasks))
     # The first task compiles for all.
-    alone = 0 if cluster else 1 if sum(steps) > LONG else len(tasks)
+    alone = 0 if cluster else 1 if steps > LONG else len(tasks)
+    with tqdm(total=steps, unit="step", unit_scale=True, leave=False, disable=quiet or None) as bar:
+        done = _run_all(tasks, alone, bar, cluster)
+        table = pd.concat([rows for rows, _ in done], ignore_index=True)
+        signals = {(task[1].name, task[0].name): first for task, (_, first) in zip(tasks, done, strict=True)}
+        earlier = earlier_bound(bounds, table, cases, contenders) if bounds else None
+        robust = earlier_robustness(bounds.parent / "robustness" / "robustness.csv") if bounds else {}
+        benchmark = Benchmark.of(cases, contenders, table, signals, earlier, robust)
+        if pictures:
+            more = typical_tasks(benchmark, cached)
+            bar.reset(sum(map(_steps, more)))
+            done = _run_all(more, 0 if alone < len(tasks) else len(more), bar, cluster)
+            signals |= {(task[1].name, task[0].name): first for task, (_, first) in zip(more, done, strict=True)}
+    return benchmark
+
+
+def _run_all(tasks: Sequence[Task], alone: int, bar: Any, cluster: str | None) -> list[Rows]:
+    """Run tasks, the first ``alone`` of them in this process, and the others side by side or on a cluster."""
     done: dict[int, Rows] = {}
-    with tqdm(total=sum(steps), unit="step", unit_scale=True, leave=False, disable=quiet or None) as bar:
-        for number, task in enumerate(tasks[:alone]):
-            bar.set_description(f"{task[1].name}, {task[0].name}")
-            done[number] = run_task(task, bar.update)
-        workers = min(processors(), PROCESSES)
-        for place, rows in run_parallel(run_task, tasks[alone:], cluster=cluster, processes=workers):
-            done[alone + place] = rows
-            bar.update(steps[alone + place])
-    table = pd.concat([done[number][0] for number in range(len(tasks))], ignore_index=True)
-    signals = {(case.name, each.name): done[number][1] for number, (each, case, *_) in enumerate(tasks)}
-    earlier = earlier_bound(bounds, table, cases, contenders) if bounds else None
-    robust = earlier_robustness(bounds.parent / "robustness" / "robustness.csv") if bounds else {}
-    return Benchmark.of(cases, contenders, table, signals, earlier, robust)
+    for number, task in enumerate(tasks[:alone]):
+        bar.set_description(f"{task[1].name}, {task[0].name}")
+        done[number] = run_task(task, bar.update)
+    workers = min(processors(), PROCESSES)
+    for place, rows in run_parallel(run_task, tasks[alone:], cluster=cluster, processes=workers):
+        done[alone + place] = rows
+        bar.update(_steps(tasks[alone + place]))
+    return [done[number] for number in range(len(tasks))]
+
+
+def _steps(task: Task) -> int:
+    """Number of environment steps of a task, with those of every training seed."""
+    contender, case, seeds, _ = task
+    return case.config().steps * len(seeds) * max(len(contender.trained), 1)
+
+
+def typical_tasks(benchmark: Benchmark, cached: Path) -> list[Task]:
+    """Return the tasks that give the signals of each case's :func:`.typical` crystal where it is not the first.
+
+    They are of the controllers that pictures show, of an agent with its first training seed.
+    """
+    numbers = [(case, typical(benchmark, case)) for case in benchmark.cases]
+    return [
+        (replace(each, trained=each.trained[:1], training_seeds=each.training_seeds[:1]), case,
+         [benchmark.seeds(case)[number]], cached.absolute())
+        for case, number in numbers if number for each in chosen(benchmark, case, NAMED)
+    ]  # fmt: skip
 
 
 def run_task(task: Task, progress: Callable[[int], Any] = lambda steps: None) -> Rows:

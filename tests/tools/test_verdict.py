@@ -1,6 +1,7 @@
 """Verdict and figures: who ranks first where, who is shown when there are many; colours for every reader."""
 
 import io
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from xml.etree import ElementTree
@@ -22,7 +23,7 @@ from cz_gym.evaluation.statistics import Estimate
 from cz_gym.rendering import canvas
 from cz_gym.tools.episodes import ESTIMATES
 from cz_gym.tools.registry import CONTROLLERS
-from cz_gym.tools.report import tables, task_records
+from cz_gym.tools.report import tables, task_records, vector
 from cz_gym.tools.report.figures import draw_figures
 from cz_gym.tools.report.markdown import brief, finding, terminal
 from cz_gym.tools.report.tables import FEWEST, NAMED, best_of_each_kind, chosen, looks_of
@@ -31,6 +32,7 @@ from cz_gym.tools.report.task_records import crystal_verdict
 from tests.observed import PLAIN
 from tests.samples import contender, joined, made, rolled_out
 
+SVG = "{http://www.w3.org/2000/svg}"
 BETTER, WORSE, EITHER = Estimate(-1.0, (-2.0, -0.5), 9), Estimate(1.0, (0.5, 2.0), 9), Estimate(0.1, (-1.0, 1.0), 9)
 
 
@@ -228,14 +230,41 @@ def test_the_finding_tells_those_who_are_told_apart_and_says_how_much_each_moves
         (contender("agent", training_seeds=(0,)), steps(0.2, 0.3)),
     ]  # fmt: skip
     assert finding(made(cases, *who)) == (
-        "Of controllers that are not told which scenario they meet, the agent `agent` ranks first by crystals lost, "
-        "then by cost: cost 0.2010 and 0.2010 on `randomized` and `hard`, against 0.4020 and 0.4020 of the classical "
-        "controller `free`. The best of those that are told have 0.1005 (`told`) and 0.1005 (`told`). On `randomized` "
-        "`agent`, `free` and `told` are 0.800, 0.600 and 0.900 mm off (RMSE) and move the pull speed by 0.3000, 0.2000 "
-        "and 0.5000 mm/min (RMS) a sample."
+        "Some controllers are told which scenario they meet. Of those that are not, the best agent, `agent`, ranks "
+        "before the best classical controller, `free`: its mean cost is 0.2010 against 0.4020 on `randomized` and "
+        "0.2010 against 0.4020 on `hard`. Of those that are told, the best are `told` on `randomized` (0.1005) and "
+        "`told` on `hard` (0.1005). Cost counts the radius error and the moves of both drives. On `randomized` "
+        "`agent`, `free` and `told` have errors of 0.800, 0.600 and 0.900 mm (RMSE), and change the pull speed by "
+        "0.3000, 0.2000 and 0.5000 mm/min (RMS) a sample."
     )
     assert finding(made(cases, *who[1:])) == ""
-    assert "by cost, within the intervals: cost 0.4" in finding(made(cases, *who[:3], (who[3][0], steps(0.399, 0.3))))
+    close = finding(made(cases, *who[:3], (who[3][0], steps(0.399, 0.3))))
+    assert "on `hard` (intervals overlap). Of" in close
+
+
+def test_the_plot_shows_all_whom_the_finding_names():
+    """Also where others have their places: quoted controllers and agents."""
+    cases = [find_case(name) for name in ("randomized", "hard")]
+    costs = np.linspace(1.0, 1.01, FEWEST)
+    crowd = [(each, {"cost": 3.0 * costs}) for each, _ in everyone()]
+    who = [*crowd, (contender("told", told=True), {"cost": costs}), (contender("free"), {"cost": 2.0 * costs})]
+    benchmark = made(cases, *who)
+    named = re.findall(r"`([^`]+)`", finding(benchmark))
+    assert {"told", "free", "gradient"} <= {*named}
+    assert not {"told", "free"} <= {*names(chosen(benchmark, cases[0], NAMED))}
+    for draw in (vector.result, vector.pareto):
+        words = [each.text for each in ElementTree.fromstring(draw(benchmark)).iter(f"{SVG}text")]
+        assert {*named} - {each.name for each in cases} <= {*words}
+
+
+def test_the_crystal_that_pictures_show_is_usual_for_every_controller():
+    """Not the first, where one was lucky, and not the last, which the agent lost."""
+    paper, agent = contender("paper"), contender("a", training_seeds=(0, 1))
+    errors = [0.1, 2.0, 1.8, 1.0, 4.0], [[0.4, 0.2, 0.55, 0.5, 8.0], [0.5, 9.0, 9.0, 9.0, 9.0]]
+    benchmark = made(NOMINAL, (paper, {"rmse_mm": errors[0]}), (agent, {"rmse_mm": errors[1]}))
+    assert tables.typical(benchmark, NOMINAL) == 2
+    unknown = made(NOMINAL, (paper, {"rmse_mm": [np.nan] * 3}), (agent, {"rmse_mm": [1.0, 2.0, 4.0]}))
+    assert tables.typical(unknown, NOMINAL) == 1
 
 
 @pytest.mark.parametrize("columns", [80, 200])
@@ -262,7 +291,7 @@ def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_f
     assert list(figures) == ["result.svg", "pareto.svg", "crystal.png"]
     assert figures["crystal.png"].startswith(b"\x89PNG")
     for name in ("result.svg", "pareto.svg"):
-        words = [each.text for each in ElementTree.fromstring(figures[name]).iter("{http://www.w3.org/2000/svg}text")]
+        words = [each.text for each in ElementTree.fromstring(figures[name]).iter(f"{SVG}text")]
         assert who[0] in words
     inches = Image.open(io.BytesIO(figures["crystal.png"])).width / DPI
     assert 830.0 / inches * 8.0 / 72.0 > 10.0, "8 point text is too small where a page shows the figure 830 pixels wide"

@@ -1,4 +1,4 @@
-"""The figures of ``report.md``: the vector pictures, and the first crystal under some controllers as PNG."""
+"""The figures of ``report.md``: the vector pictures, and a typical crystal under some controllers as PNG."""
 
 from collections.abc import Callable
 from textwrap import fill
@@ -15,7 +15,7 @@ from cz_gym.tools.episodes import Benchmark
 from cz_gym.tools.report.task_records import task_of
 
 from . import vector
-from .tables import RMSE, chosen, looks_of
+from .tables import RMSE, chosen, looks_of, typical
 
 
 def draw_figures(benchmark: Benchmark) -> dict[str, bytes]:
@@ -26,24 +26,24 @@ def draw_figures(benchmark: Benchmark) -> dict[str, bytes]:
     return {name: vector.as_file(picture) for name, picture in pictures.items()} | {"crystal.png": drawn}
 
 
-# The first crystal of a scenario.
+# The typical crystal of a scenario.
 
 
 def lost(benchmark: Benchmark, case: Case, name: str) -> bool:
-    """Return whether the first crystal was lost, with the first training seed."""
-    return bool(benchmark.values(case, name, "failure_rate")[0, 0])
+    """Return whether the :func:`.typical` crystal was lost, with the first training seed."""
+    return bool(benchmark.values(case, name, "failure_rate")[0, typical(benchmark, case)])
 
 
 def crystal(benchmark: Benchmark, case: Case) -> bytes:
-    """Draw the first crystal of a scenario under the controllers of :func:`.chosen`."""
+    """Draw the :func:`.typical` crystal of a scenario under the controllers of :func:`.chosen`."""
     if task_of(case).by_length:
         return _by_length(benchmark, case)
-    crystals = []
+    crystals, number = [], typical(benchmark, case)
     for name in (each.name for each in chosen(benchmark, case, COLUMNS)):
-        title = f"{fill(name, 18)}\nRMSE {benchmark.values(case, name, RMSE.metric)[0, 0]:.3g} mm"
+        title = f"{fill(name, 18)}\nRMSE {benchmark.values(case, name, RMSE.metric)[0, number]:.3g} mm"
         signals = benchmark.signals[case.name, name]
         crystals.append(DrawnCrystal(title, signals, lost(benchmark, case, name)))
-    title = f"One crystal of {case.name} (test seed {benchmark.seeds(case)[0]:,})"
+    title = f"A typical crystal of {case.name} (test seed {benchmark.seeds(case)[number]:,})"
     return png(draw(crystals, case.control_interval, title, case.tolerance or 0.0))
 
 
@@ -103,8 +103,9 @@ def _by_length(benchmark: Benchmark, case: Case) -> bytes:
         axis.set_ylabel(panel.label.replace(" [", "\n["))
     axis.set_xlabel("length [mm]")
     figure.suptitle(
-        f"One crystal, {case.name} (test seed {benchmark.seeds(case)[0]:,}); dashed: the recipe", fontsize=10.5
-    )
+        f"A typical crystal, {case.name} (test seed {benchmark.seeds(case)[typical(benchmark, case)]:,}); "
+        "dashed: the recipe", fontsize=10.5,
+    )  # fmt: skip
     return png(figure)
 
 

@@ -156,22 +156,8 @@ def brief(benchmark: Benchmark) -> str:
     return summary(benchmark.only(cases, tables.chosen(benchmark, cases[0], task_of(cases[0]).quoted_rows)))
 
 
-def _firsts(benchmark: Benchmark, cases: Sequence[Case]) -> list[Contender]:
-    """Return who ranks first of the agents and of the classical controllers that are not told the scenario, in order,
-    and on each scenario of those that are.
-
-    Shorter where such controllers did not take part; bounds left out.
-    """
-    able = [each for each in benchmark.contenders if not each.bound]
-    told = [each for each in able if each.told]
-    kinds = [[each for each in able if not each.told and each.learned is learned] for learned in (True, False)]
-    firsts = [min(kind, key=lambda each: benchmark.rank(cases, each.name)) for kind in kinds if kind]
-    firsts.sort(key=lambda each: benchmark.rank(cases, each.name))
-    return [*firsts, *(min(told, key=lambda each: benchmark.rank([case], each.name)) for case in cases if told)]
-
-
 def finding(benchmark: Benchmark) -> str:
-    """Say what was found in two sentences: the best of those not told the scenario, of each kind, and of those told.
+    """Say who is best of those not told the scenario, of each kind, who of those told, and how much they move.
 
     Empty where one of the three is missing, for a puller or of whole crystals, and for a few crystals.
     """
@@ -179,30 +165,31 @@ def finding(benchmark: Benchmark) -> str:
     graded = cases[0].tolerance is not None or task_of(cases[0]).by_length
     if graded or tables.too_few(benchmark):
         return ""
-    firsts = _firsts(benchmark, cases)
+    firsts = tables.firsts(benchmark)
     if len(firsts) < 2 + len(cases):
         return ""
     best, other, *told = firsts
     cost, error, step = (each._replace(interval=False) for each in (tables.COST, tables.RMSE, tables.PULL_STEP))
-    costs = [" and ".join(cost.of(benchmark, case, each.name) for case in cases) for each in (best, other)]
-    aware = [f"{cost.of(benchmark, case, each.name)} (`{each.name}`)" for case, each in zip(cases, told, strict=True)]
+    pairs = [_against(benchmark, case, best, other, cost) for case in cases]
+    aware = [f"`{each.name}` on `{case.name}` ({cost.of(benchmark, case, each.name)})"
+             for case, each in zip(cases, told, strict=True)]  # fmt: skip
     moves = [column.of(benchmark, cases[0], each.name) for column in (error, step) for each in firsts[:3]]
-    near = "" if _apart(benchmark, cases, best, other) else ", within the intervals"
-    kinds = ["the agent" if each.learned else "the classical controller" for each in (best, other)]
+    kinds = ["agent" if each.learned else "classical controller" for each in (best, other)]
     return (
-        f"Of controllers that are not told which scenario they meet, {kinds[0]} `{best.name}` ranks first by crystals "
-        f"lost, then by cost{near}: cost {costs[0]} on "
-        f"{' and '.join(f'`{case.name}`' for case in cases)}, against {costs[1]} of {kinds[1]} `{other.name}`. "
-        f"The best of those that are told have {' and '.join(aware)}. On `{cases[0].name}` `{best.name}`, "
-        f"`{other.name}` and `{told[0].name}` "
-        "are {}, {} and {} mm off (RMSE) and move the pull speed by {}, {} and {} mm/min (RMS) a sample.".format(*moves)
+        f"Some controllers are told which scenario they meet. Of those that are not, the best {kinds[0]}, "
+        f"`{best.name}`, ranks before the best {kinds[1]}, `{other.name}`: its mean cost is {' and '.join(pairs)}. "
+        f"Of those that are told, the best are {' and '.join(aware)}. Cost counts the radius error and the moves of "
+        f"both drives. On `{cases[0].name}` `{best.name}`, `{other.name}` and `{told[0].name}` have errors of "
+        "{}, {} and {} mm (RMSE), and change the pull speed by {}, {} and {} mm/min (RMS) a sample.".format(*moves)
     )
 
 
-def _apart(benchmark: Benchmark, cases: Sequence[Case], best: Contender, other: Contender) -> bool:
-    """Return whether the first one's cost is lower than the other's on each scenario, beyond both intervals."""
+def _against(benchmark: Benchmark, case: Case, best: Contender, other: Contender, cost: tables.Column) -> str:
+    """Compare mean costs on a scenario, and say where their intervals overlap."""
     get: Any = benchmark.get
-    return all(get(case, best.name, "cost").ends[1] < get(case, other.name, "cost").ends[0] for case in cases)
+    ours, theirs = (get(case, each.name, cost.metric) for each in (best, other))
+    near = "" if ours.ends[1] < theirs.ends[0] else " (intervals overlap)"
+    return f"{cost.text(ours)} against {cost.text(theirs)} on `{case.name}`{near}"
 
 
 def fill_in(page: str, benchmark: Benchmark) -> str:

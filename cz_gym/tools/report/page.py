@@ -25,7 +25,7 @@ from cz_gym.tools.report.task_records import task_of
 from . import markdown, tables, vector
 from .figures import lost
 from .markdown import measured_from
-from .tables import NAMED, RMSE, chosen
+from .tables import NAMED, RMSE, chosen, typical
 
 POINT, POINTS = 45.0, 400
 """Time over which a point of a line is the mean at least [s], and most points of a line."""
@@ -38,7 +38,7 @@ COLOURS = {"true": TRUE, "camera": RING, "recipe": INK, "drive": DRIVE}
 
 
 def crystals(benchmark: Benchmark) -> list[dict[str, Any]]:
-    """Return the first crystal of each scenario under the controllers of :func:`.chosen`, for the page's player.
+    """Return the :func:`.typical` crystal of each scenario under the controllers of :func:`.chosen`, for the player.
 
     Each panel's lines are means over some seconds, up to the first value that is no number, in the panel's unit.
     """
@@ -46,7 +46,8 @@ def crystals(benchmark: Benchmark) -> list[dict[str, Any]]:
 
 
 def _crystal(benchmark: Benchmark, case: Case) -> dict[str, Any]:
-    task, seed = task_of(case), benchmark.seeds(case)[0]
+    task, number = task_of(case), typical(benchmark, case)
+    seed = benchmark.seeds(case)[number]
     names = [each.name for each in chosen(benchmark, case, NAMED)]
     signals = {name: benchmark.signals[case.name, name] for name in names}
     longest = max(len(each.r_c) for each in signals.values())
@@ -58,7 +59,7 @@ def _crystal(benchmark: Benchmark, case: Case) -> dict[str, Any]:
             f"{panel.title}/{line}": _points(signal(logged, bias) / panel.scale, step)
             for panel in task.panels for line, signal in panel.lines.items()
         }  # fmt: skip
-        rmse = float(benchmark.values(case, name, RMSE.metric)[0, 0])
+        rmse = float(benchmark.values(case, name, RMSE.metric)[0, number])
         runs.append({"name": name, "lost": lost(benchmark, case, name), "rmse": round(rmse, DIGITS), "lines": lines})
     whole = [run for run in runs if not run["lost"]] or runs
     panels = []
@@ -115,7 +116,8 @@ def page(benchmark: Benchmark, command: str) -> str:
         "style": _asset("page.css") + _signal_colours() + vector.STYLE,
         "script": _asset("player.js"),
         "data": json.dumps(crystals(benchmark), separators=(",", ":")).replace("<", "\\u003c"),
-        "verdict": escape(" ".join((verdict.sentence, markdown.finding(benchmark).replace("`", "")))),
+        "verdict": escape(verdict.sentence),
+        "finding": escape(markdown.finding(benchmark).replace("`", "")),
         "best": _table(heads, [(f"{name} [{kind}]", *cells) for kind, rows in groups.items() for name, *cells in rows]),
         "best_note": BEST_NOTE,
         "question": "Who ranks first where",
@@ -175,8 +177,9 @@ def _table(heads: Iterable[str], rows: Iterable[Iterable[str]], kind: str = "fig
         f"<tr>{_cell('th', name)}{''.join(_cell('td', cell) for cell in cells)}</tr>" for name, *cells in rows
     )
     return (
-        f'<div class="scroll"><table class="{kind}">\n<thead><tr>{"".join(_cell("th", head) for head in heads)}</tr>'
-        f"</thead>\n<tbody>\n{lines}\n</tbody></table></div>"
+        f'<div class="scroll" tabindex="0"><table class="{kind}">\n'
+        f"<thead><tr>{''.join(_cell('th', head) for head in heads)}</tr></thead>\n"
+        f"<tbody>\n{lines}\n</tbody></table></div>"
     )
 
 

@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from cz_gym.evaluation.protocol import REFERENCE, Case, Contender
 from cz_gym.evaluation.statistics import Estimate
 from cz_gym.support.units import PERCENT
@@ -12,6 +14,8 @@ if TYPE_CHECKING:
     from cz_gym.tools.episodes import Benchmark
 
 NOTHING = "-"
+ERRORS = 1e-6, 1e3
+"""Range of the errors that :func:`typical` compares [mm]."""
 NAMED = 8
 """Most controllers with a look of their own in a figure."""
 FEWEST = 20
@@ -148,6 +152,38 @@ def best_of_each_kind(benchmark: "Benchmark") -> list[Contender]:
     ranked = sorted(able, key=lambda each: benchmark.rank(cases, each.name), reverse=True)
     best = {each.knows: each.name for each in ranked}
     return [each for each in able if each.name in best.values() or each.own]
+
+
+def firsts(benchmark: "Benchmark") -> list[Contender]:
+    """Return who ranks first, over the first two deciding scenarios, of the agents and of the classical controllers
+    that are not told the scenario, in order, and on each of the two of those that are.
+
+    Shorter where such controllers did not take part; bounds left out.
+    """
+    cases = deciding(benchmark)[:2]
+    able = [each for each in benchmark.contenders if not each.bound]
+    told = [each for each in able if each.told]
+    kinds = [[each for each in able if not each.told and each.learned is learned] for learned in (True, False)]
+    found = [min(kind, key=lambda each: benchmark.rank(cases, each.name)) for kind in kinds if kind]
+    found.sort(key=lambda each: benchmark.rank(cases, each.name))
+    return [*found, *(min(told, key=lambda each: benchmark.rank([case], each.name)) for case in cases if told)]
+
+
+def in_one_look(benchmark: "Benchmark") -> list[Contender]:
+    """Return the controllers of :func:`chosen` and of :func:`firsts`, which the finding names, in their order."""
+    names = [each.name for each in (*chosen(benchmark, deciding(benchmark)[0], NAMED), *firsts(benchmark))]
+    return [each for each in benchmark.contenders if each.name in names]
+
+
+def typical(benchmark: "Benchmark", case: Case) -> int:
+    """Return the place of the crystal that pictures show: of those that all met, the one on which no controller of
+    :func:`chosen` is far from its usual error, by the largest ratio of its RMSE and its median.
+    """
+    names = [each.name for each in chosen(benchmark, case, NAMED)]
+    met = min(len(benchmark.seeds(case, name)) for name in names)
+    errors = np.stack([benchmark.values(case, name, RMSE.metric)[0, :met] for name in names])
+    logs = np.log(np.clip(np.nan_to_num(errors, nan=np.inf), *ERRORS))
+    return int(np.abs(logs - np.median(logs, axis=1, keepdims=True)).max(axis=0).argmin())
 
 
 def looks_of(benchmark: "Benchmark") -> "dict[str, Style]":

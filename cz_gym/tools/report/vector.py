@@ -14,15 +14,15 @@ from cz_gym.evaluation.statistics import Estimate
 from cz_gym.puller.file import DEFAULT
 from cz_gym.tools.episodes import Benchmark
 
-from .tables import NAMED, PULL_STEP, RMSE, chosen, deciding, looks_of
+from .tables import PULL_STEP, RMSE, deciding, in_one_look, looks_of
 
-WIDTH = 830.0
-"""Width of a picture [px]: that of a README."""
+WIDTH = 640.0
+"""Width of a picture [px]: its words can be read on a phone too, where it is drawn at about half of that."""
 FAR = 30.0
 """Values beyond this multiple of the least one stand at an axis's end, with their number [-]."""
 LONGEST = 20
 """Longest name that there is room for [characters]."""
-PLAIN = {"randomized": "usual disturbances", "hard": "hard disturbances"}
+PLAIN = {"randomized": "randomized (usual)"}
 """Scenarios in plain words."""
 STYLE = "\n".join(
     (
@@ -74,7 +74,8 @@ class Axis(NamedTuple):
 
 def svg(height: float, parts: Iterable[str], title: str) -> str:
     """Return a picture of :data:`WIDTH` and this height [px], with its title for those who do not see it."""
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" class="cz" viewBox="0 0 {WIDTH:g} {height:g}" role="img">'
+    size = f'width="{WIDTH:g}" height="{height:g}" viewBox="0 0 {WIDTH:g} {height:g}"'
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" class="cz" {size} role="img">'
     ground = f'<rect class="back" width="{WIDTH:g}" height="{height:g}"/>'
     return "\n".join((head, f"<title>{escape(title)}</title>", ground, *parts, "</svg>")) + "\n"
 
@@ -127,14 +128,14 @@ def short(name: str) -> str:
 
 # The result in one look.
 
-LABELS, ROW, TOP = 178.0, 33.0, 68.0
+LABELS, ROW, TOP = 208.0, 31.0, 68.0
 """Width of the names, height of a row, and of what stands above the rows [px]."""
 
 
 def result(benchmark: Benchmark) -> str:
     """Draw controllers as rows, their mean RMSE and its interval on a logarithmic axis, in the first two scenarios."""
     cases = deciding(benchmark)[:2]
-    shown = chosen(benchmark, cases[0], NAMED)
+    shown = in_one_look(benchmark)
     looks = looks_of(benchmark)
     known = {(case.name, each.name): benchmark.get(case, each.name, RMSE.metric) for case in cases for each in shown}
     there = [found for found in known.values() if found]
@@ -146,8 +147,8 @@ def result(benchmark: Benchmark) -> str:
     for number, case in enumerate(cases):
         left = LABELS + number * room
         axis = Axis.around(reached, left + 14.0, left + room - 14.0)
-        plain = f"{PLAIN[case.name]} ({case.name})" if case.name in PLAIN else case.name
-        parts += [text(axis.start, TOP - 12.0, plain, class_="faint", font_size="17"), *_scale(axis, TOP, bottom)]
+        head = text(axis.start, TOP - 12.0, PLAIN.get(case.name, case.name), class_="faint", font_size="17")
+        parts += [head, *_scale(axis, TOP, bottom)]
         for row, each in enumerate(shown):
             parts += _row(
                 axis, TOP + (row + 0.5) * ROW, known[case.name, each.name], looks[each.name], is_told(each, case)
@@ -155,10 +156,13 @@ def result(benchmark: Benchmark) -> str:
     for row, each in enumerate(shown):
         parts += [text(LABELS - 4.0, TOP + (row + 0.5) * ROW + 5.5, short(each.name), "end")]
     told = "which scenario it meets" if any(each.told for each in shown) else "what no sensor shows"
-    parts += _key(bottom + 52.0, f"hollow: told {told}", shown, cases[0])
-    bars = f"; bars are 95 % intervals over {crystals} test crystals" if crystals > 1 else ""
-    parts += [text(12.0, bottom + 84.0, f"mean of all crystals, lost ones included{bars}", class_="faint")]
-    return svg(bottom + 100.0, parts, "Radius error of each controller: " + _spoken(known))
+    hollow = any(is_told(each, cases[0]) for each in shown)
+    notes = ["mean of all crystals, lost ones included"]
+    notes += [f"bars: 95 % intervals over {crystals} test crystals"] if crystals > 1 else []
+    top = bottom + 84.0 + 28.0 * hollow
+    parts += _key(bottom + 52.0, f"hollow: told {told}" if hollow else "", any(each.learned for each in shown))
+    parts += [text(12.0, top + 26.0 * row, note, class_="faint") for row, note in enumerate(notes)]
+    return svg(top - 10.0 + 26.0 * len(notes), parts, "Radius error of each controller: " + _spoken(known))
 
 
 def _spoken(known: dict[tuple[str, str], Estimate | None]) -> str:
@@ -185,29 +189,29 @@ def _row(axis: Axis, y: float, found: Estimate | None, look: Style, told: bool) 
     return [*parts, bar(axis.at(low), y, axis.at(high), y, look), mark(axis.at(found.mean), y, look, told)]
 
 
-def _key(y: float, told: str, shown: Iterable[Contender], case: Case) -> list[str]:
+def _key(y: float, told: str, learned: bool) -> list[str]:
     """Say what the kinds of marks mean that there are."""
-    ink, shown = Style(COLOURS[-1], "circle", ()), [*shown]
+    ink = Style(COLOURS[-1], "circle", ())
     keys = [(ink, False, "classical")]
-    keys += [(ink._replace(mark="diamond"), False, "diamonds: learned")] if any(each.learned for each in shown) else []
-    keys += [(ink, True, told)] if any(is_told(each, case) for each in shown) else []
-    parts, x = [], 22.0
-    for look, hollow, words in keys:
-        parts += [mark(x, y, look, hollow), text(x + 16.0, y + 5.5, words)]
-        x += 44.0 + 9.6 * len(words)
+    keys += [(ink._replace(mark="diamond"), False, "diamonds: learned")] if learned else []
+    keys += [(ink, True, told)] if told else []
+    parts = []
+    for number, (look, hollow, words) in enumerate(keys):  # what is hollow has a line of its own
+        x, row = (22.0, y + 28.0) if hollow else (22.0 + 150.0 * number, y)
+        parts += [mark(x, row, look, hollow), text(x + 16.0, row + 5.5, words)]
     return parts
 
 
 # Error against pull activity.
 
-SIDE, PANEL = 396.0, 250.0
-"""Width and height of a scenario's panel [px]."""
+SIDE, PANEL, ACROSS = 301.0, 220.0, 3
+"""Width and height of a scenario's panel [px], and names of the key beside each other."""
 
 
 def pareto(benchmark: Benchmark) -> str:
     """Draw mean RMSE against mean pull step RMS of each random scenario; the :func:`.chosen` have marks and bars."""
     cases = deciding(benchmark)
-    named = chosen(benchmark, cases[0], NAMED)
+    named = in_one_look(benchmark)
     looks = looks_of(benchmark)
     rows = -(-len(cases) // 2)
     parts = [text(12.0, 24.0, "Error against pull activity: lower left is better", font_weight="bold")]
@@ -228,13 +232,14 @@ def pareto(benchmark: Benchmark) -> str:
             parts += _point(benchmark, case, each, looks[each.name] if each in named else None, across, up)
     top = 34.0 + rows * (PANEL + 60.0) + 16.0
     for number, each in enumerate(named):
-        x, y = 24.0 + number % 4 * 200.0, top + number // 4 * 28.0
+        x, y = 24.0 + number % ACROSS * 205.0, top + number // ACROSS * 28.0
         parts += [mark(x, y, looks[each.name], is_told(each, cases[0]))]
         parts += [text(x + 14.0, y + 5.5, short(each.name), font_size="16")]
-    height = top + -(-len(named) // 4) * 28.0
-    said = "hollow: told which scenario it meets; grey: others; bars: 95 % intervals; an arrow: further off"
-    parts += [text(12.0, height, said, class_="faint", font_size="16")]
-    return svg(height + 16.0, parts, "Error against pull activity")
+    height = top + -(-len(named) // ACROSS) * 28.0
+    for said in ("hollow: told which scenario it meets; grey: others", "bars: 95 % intervals; an arrow: further off"):
+        parts += [text(12.0, height, said, class_="faint", font_size="16")]
+        height += 24.0
+    return svg(height - 8.0, parts, "Error against pull activity")
 
 
 def _point(benchmark: Benchmark, case: Case, each: Contender, look: Style | None, across: Axis, up: Axis) -> list[str]:
