@@ -230,16 +230,16 @@ def test_the_finding_tells_those_who_are_told_apart_and_says_how_much_each_moves
         (contender("agent", training_seeds=(0,)), steps(0.2, 0.3)),
     ]  # fmt: skip
     assert finding(made(cases, *who)) == (
-        "Some controllers are told which scenario they meet. Of those that are not, the best agent, `agent`, ranks "
-        "before the best classical controller, `free`: its mean cost is 0.2010 against 0.4020 on `randomized` and "
-        "0.2010 against 0.4020 on `hard`. Of those that are told, the best are `told` on `randomized` (0.1005) and "
-        "`told` on `hard` (0.1005). Cost counts the radius error and the moves of both drives. On `randomized` "
-        "`agent`, `free` and `told` have errors of 0.800, 0.600 and 0.900 mm (RMSE), and change the pull speed by "
-        "0.3000, 0.2000 and 0.5000 mm/min (RMS) a sample."
+        "**Of those that are not told which scenario they meet, the learned agent `agent` ranks first.** The best "
+        "classical controller of them is `free`. Mean cost, which counts the radius error and the moves of both "
+        "drives: 0.2010 against 0.4020 on `randomized`; 0.2010 against 0.4020 on `hard`. Told the scenario, the best "
+        "are `told` on `randomized` (0.1005) and `told` on `hard` (0.1005). Radius error on `randomized`: `agent` "
+        "0.800, `free` 0.600, `told` 0.900 mm (RMSE); from sample to sample, their pull speed changes by 0.3000, "
+        "0.2000 and 0.5000 mm/min (RMS)."
     )
     assert finding(made(cases, *who[1:])) == ""
     close = finding(made(cases, *who[:3], (who[3][0], steps(0.399, 0.3))))
-    assert "on `hard` (intervals overlap). Of" in close
+    assert "on `hard` (intervals overlap). Told" in close
 
 
 def test_the_plot_shows_all_whom_the_finding_names():

@@ -173,14 +173,15 @@ def finding(benchmark: Benchmark) -> str:
     pairs = [_against(benchmark, case, best, other, cost) for case in cases]
     aware = [f"`{each.name}` on `{case.name}` ({cost.of(benchmark, case, each.name)})"
              for case, each in zip(cases, told, strict=True)]  # fmt: skip
-    moves = [column.of(benchmark, cases[0], each.name) for column in (error, step) for each in firsts[:3]]
-    kinds = ["agent" if each.learned else "classical controller" for each in (best, other)]
+    errors = [f"`{each.name}` {error.of(benchmark, cases[0], each.name)}" for each in firsts[:3]]
+    moves = [step.of(benchmark, cases[0], each.name) for each in firsts[:3]]
+    kinds = ["learned agent" if each.learned else "classical controller" for each in (best, other)]
     return (
-        f"Some controllers are told which scenario they meet. Of those that are not, the best {kinds[0]}, "
-        f"`{best.name}`, ranks before the best {kinds[1]}, `{other.name}`: its mean cost is {' and '.join(pairs)}. "
-        f"Of those that are told, the best are {' and '.join(aware)}. Cost counts the radius error and the moves of "
-        f"both drives. On `{cases[0].name}` `{best.name}`, `{other.name}` and `{told[0].name}` have errors of "
-        "{}, {} and {} mm (RMSE), and change the pull speed by {}, {} and {} mm/min (RMS) a sample.".format(*moves)
+        f"**Of those that are not told which scenario they meet, the {kinds[0]} `{best.name}` ranks first.** The best "
+        f"{kinds[1]} of them is `{other.name}`. Mean cost, which counts the radius error and the moves of both "
+        f"drives: {'; '.join(pairs)}. Told the scenario, the best are {' and '.join(aware)}. Radius error on "
+        f"`{cases[0].name}`: {', '.join(errors)} mm (RMSE); from sample to sample, their pull speed changes by "
+        "{}, {} and {} mm/min (RMS).".format(*moves)
     )
 
 

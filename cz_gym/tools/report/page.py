@@ -117,7 +117,7 @@ def page(benchmark: Benchmark, command: str) -> str:
         "script": _asset("player.js"),
         "data": json.dumps(crystals(benchmark), separators=(",", ":")).replace("<", "\\u003c"),
         "verdict": escape(verdict.sentence),
-        "finding": escape(markdown.finding(benchmark).replace("`", "")),
+        "finding": escape(re.sub(r"[`*]", "", markdown.finding(benchmark))),
         "best": _table(heads, [(f"{name} [{kind}]", *cells) for kind, rows in groups.items() for name, *cells in rows]),
         "best_note": BEST_NOTE,
         "question": "Who ranks first where",
