@@ -152,7 +152,7 @@ def test_the_same_results_give_the_same_bytes_and_few_of_them(made):
 
 def test_a_table_holds_no_nan_and_says_what_a_dash_means(made):
     assert not re.search(r"\bnan\b", made.text, re.IGNORECASE)
-    assert "a dash where a metric does not apply" in made.text
+    assert "A dash: the metric does not apply" in made.text
     lone = Estimate(1.0, (np.nan, np.nan), 3)
     assert tables.RMSE.text(lone) == "1.000"
 
