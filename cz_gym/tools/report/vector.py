@@ -192,12 +192,12 @@ def _row(axis: Axis, y: float, found: Estimate | None, look: Style, told: bool) 
 def _key(y: float, told: str, learned: bool) -> list[str]:
     """Say what the kinds of marks mean that there are."""
     ink = Style(COLOURS[-1], "circle", ())
-    keys = [(ink, False, "classical")]
+    keys = [(ink, False, "other marks: classical" if learned else "classical")]
     keys += [(ink._replace(mark="diamond"), False, "diamonds: learned")] if learned else []
     keys += [(ink, True, told)] if told else []
     parts = []
     for number, (look, hollow, words) in enumerate(keys):  # what is hollow has a line of its own
-        x, row = (22.0, y + 28.0) if hollow else (22.0 + 150.0 * number, y)
+        x, row = (22.0, y + 28.0) if hollow else (22.0 + 236.0 * number, y)
         parts += [mark(x, row, look, hollow), text(x + 16.0, row + 5.5, words)]
     return parts
 
