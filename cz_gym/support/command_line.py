@@ -16,7 +16,7 @@ from .errors import CzError
 OPTIONAL = (
     "aiohttp", "array_api_compat", "asyncua", "blark", "casadi", "control", "cryptography", "distributed", "envpool",
     "filelock", "fmpy", "h5py", "matplotlib", "minari", "onnx", "onnxruntime", "pandas", "pillow", "pyarrow", "pygame",
-    "pythonfmu", "sb3_contrib", "selenium", "stable_baselines3", "tensorboard", "torch", "torchrl", "tqdm",
+    "pythonfmu", "sb3_contrib", "selenium", "skrl", "stable_baselines3", "tensorboard", "torch", "torchrl", "tqdm",
 )  # fmt: skip
 """Modules of the packages in the extras of ``pyproject.toml``."""
 OWN_EXTRA = {"distributed": "cluster", "casadi": "mpc"}
