@@ -168,7 +168,7 @@ def _client(distributed: Any, address: str) -> Iterator[Any]:
     """Connect to the scheduler; CzError if none answers, or no worker comes."""
     try:
         client = distributed.Client(address, timeout=ANSWER, set_as_default=False)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, AssertionError) as error:  # asserted: the loop's thread runs within ten seconds
         raise CzError(
             f"no Dask scheduler answers at {address!r}, an address such as tcp://HOST:8786: {error}"
         ) from None
