@@ -169,9 +169,8 @@ def _client(distributed: Any, address: str) -> Iterator[Any]:
     try:
         client = distributed.Client(address, timeout=ANSWER, set_as_default=False)
     except (OSError, ValueError, AssertionError) as error:  # asserted: the loop's thread runs within ten seconds
-        raise CzError(
-            f"no Dask scheduler answers at {address!r}, an address such as tcp://HOST:8786: {error}"
-        ) from None
+        why = str(error) or "this computer is too busy to ask"
+        raise CzError(f"no Dask scheduler answers at {address!r}, an address such as tcp://HOST:8786: {why}") from None
     with client:
         try:
             client.wait_for_workers(1, timeout=ANSWER)

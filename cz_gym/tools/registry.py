@@ -234,11 +234,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = OneLineParser("cz-gym list", "List the names that commands take, with a line on each.")
     add, about = parser.add_argument, f"{', '.join(KINDS)} (all of them)"
-    add("kinds", nargs="*", choices=[*KINDS, []], default=[], metavar="KIND", help=about)
+    add("kinds", nargs="*", metavar="KIND", help=about)
     return parser.run(_main, arguments, "benchmark")
 
 
 def _main(given: argparse.Namespace) -> None:
+    if unknown := [kind for kind in given.kinds if kind not in KINDS]:
+        raise CzError(unknown_name_message("list", unknown[0], KINDS))
     for kind in given.kinds or KINDS:
         for heading, lines in KINDS[kind]():
             column = max(len(name) for name, _ in lines) + 4

@@ -253,6 +253,11 @@ def test_a_whole_number_is_read_as_it_is_written(text):
             between(LEAST, MOST)(text)
 
 
+def test_an_unknown_list_is_told_with_the_closest_one(capsys):
+    assert cz_gym_command.main(["list", "pullres"]) == 2
+    assert "did you mean 'pullers'? Choose from controllers, scenarios" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("words", [["list"], ["list", "stages", "agents"]])
 def test_lists_name_everything_that_commands_take_in_80_columns(words, capsys):
     assert cz_gym_command.main(words) == 0
