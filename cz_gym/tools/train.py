@@ -199,12 +199,13 @@ def _setting(text: str, recipe: TrainingConfig) -> tuple[str, Any]:
             raise ValueError
         return name, typed
     except ValueError:
-        kind = "numbers with commas between" if isinstance(usual, tuple) else type(usual).__name__
+        kinds = {tuple: "numbers with commas between", int: "a whole number from 1 on"}
+        kind = kinds.get(type(usual), type(usual).__name__)
         raise CzError(f"--set {text}: {name} must be {kind}, as {usual!r}") from None
 
 
 def _typed(text: str, usual: Any) -> Any:
-    """A text as a value of the type of the usual one; ValueError if it is none, or a number that is not positive."""
+    """A text as a value of the type of the usual one; ValueError if it is none, a negative number, or a count of none."""
     if isinstance(usual, bool):
         words = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
         if text.lower() not in words:
@@ -215,7 +216,8 @@ def _typed(text: str, usual: Any) -> Any:
     if isinstance(usual, str):
         return text
     number = type(usual)(float(text)) if isinstance(usual, int) and float(text).is_integer() else type(usual)(text)
-    if not math.isfinite(number) or (number <= 0 and usual > 0 and not 0 <= number == int(number)):
+    least = 1 if isinstance(usual, int) else 0
+    if not math.isfinite(number) or (usual > 0 and number < least):
         raise ValueError
     return number
 
