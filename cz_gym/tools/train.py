@@ -205,7 +205,7 @@ def _setting(text: str, recipe: TrainingConfig) -> tuple[str, Any]:
 
 
 def _typed(text: str, usual: Any) -> Any:
-    """A text as a value of the type of the usual one; ValueError if it is none, a negative number, or a count of none."""
+    """A text as a value of the type of the usual one; ValueError if it is none, negative, or a count of 0."""
     if isinstance(usual, bool):
         words = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
         if text.lower() not in words:
