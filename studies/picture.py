@@ -39,12 +39,12 @@ SIZE, PANEL, CHART = (414, 366), Box(4.0, 34.0, 406.0, 226.0), Box(44.0, 268.0, 
 """Pixels of a side, of its cross-section, and of its chart."""
 LARGEST = 5.0 * MM
 """Radius error at the chart's ends [m]."""
-FRAME, LAST = 80, 3000
-"""Time of a frame, and of the last one [ms]."""
+FRAME, END = 80, 2000
+"""Time of a frame, and of the end, which is shown first and last [ms]."""
 
 
 def frames(seed: int = SEED, time: float = TIME) -> Iterator[Frame]:
-    """Grow the crystal under both controllers, and draw every third sample."""
+    """Grow the crystal under both controllers, and draw every third sample, then the end with how each ended."""
     sides = [CzEnv("randomized", observation="measured", action="direct", render_mode="rgb_array") for _ in SIDES]
     policies = [make_controller(name, env.config) for name, env in zip(SIDES, sides, strict=True)]
     seen, states = [env.reset(seed=seed)[0] for env in sides], [None, None]
@@ -57,11 +57,16 @@ def frames(seed: int = SEED, time: float = TIME) -> Iterator[Frame]:
                 )
                 seen[number] = env.step(action[0])[0]
         if step % EVERY == 0:
-            yield np.concatenate([_side(record_of(env), name, view, time) for env, name in
-                                  zip(sides, SIDES.values(), strict=True)], axis=1)  # fmt: skip
+            yield _both(sides, view, time, False)
+    yield _both(sides, view, time, True)
 
 
-def _side(record: Record, name: str, view: Any, time: float) -> Frame:
+def _both(sides: Sequence[CzEnv], view: Any, time: float, ended: bool) -> Frame:
+    halves = [_side(record_of(env), name, view, time, ended) for env, name in zip(sides, SIDES.values(), strict=True)]
+    return np.concatenate(halves, axis=1)
+
+
+def _side(record: Record, name: str, view: Any, time: float, ended: bool) -> Frame:
     """One controller's half of a frame."""
     canvas = Canvas(*SIZE)
     canvas.unit, canvas.box = 1.0, Box(0.0, 0.0, *map(float, SIZE))
@@ -70,11 +75,12 @@ def _side(record: Record, name: str, view: Any, time: float) -> Frame:
     canvas.text(canvas.box.right - 8, 10, f"{record.t[-1] / MINUTE:.0f} min", palette.FAINT, 13, 1.0)
     draw(canvas, PANEL, record)
     canvas.text(PANEL.right - 8.0, PANEL.y + 128.0, "camera's view", palette.FAINT, 10, 1.0)
-    if record.ending is not None:
-        band = Box(PANEL.x, PANEL.y + 144.0, PANEL.w, 22.0)
-        canvas.rectangle(palette.ALARM, band)
-        words = "LOST: FROZEN" if record.ending is Ending.FROZEN else f"LOST: {record.ending.name}"
-        canvas.text(band.x + band.w / 2.0, band.y + 3.0, words, size=13, anchor=0.5, bold=True)
+    if ended or record.ending is not None:
+        lost = {None: "HELD", Ending.FROZEN: "LOST: frozen to the melt"}.get(record.ending, "LOST")
+        band = Box(PANEL.x, PANEL.bottom - 52.0, PANEL.w, 34.0)
+        canvas.rectangle(palette.WELL if record.ending is None else palette.ALARM, band)
+        words = f"{lost}, {record.error[-1] / MM:+z.1f} mm off"
+        canvas.text(band.x + band.w / 2.0, band.y + 6.0, words, palette.BACK, 18, 0.5, bold=True)
     _chart(canvas, record, time)
     frame = canvas.finish().copy()
     image = picture(record.last("r_c"), record.last("h_c"), record.puller, view)[:, :, 0]
@@ -106,11 +112,11 @@ def _chart(canvas: Canvas, record: Record, time: float) -> None:
 
 
 def moving(every: Sequence[Frame]) -> bytes:
-    """Return frames as an animated GIF of one palette."""
+    """Return frames as an animated GIF of one palette; its first is the end, for those who see one picture alone."""
     shown = Image.fromarray(np.concatenate([every[0], every[len(every) // 2], every[-1]])).quantize(96)
     images = [Image.fromarray(each).quantize(palette=shown, dither=Image.Dither.NONE) for each in every]
-    file, times = io.BytesIO(), [FRAME] * (len(images) - 1) + [LAST]
-    images[0].save(file, "gif", save_all=True, append_images=images[1:], duration=times, loop=0, optimize=True)
+    file, times = io.BytesIO(), [END, *[FRAME] * (len(images) - 1), END]
+    images[-1].save(file, "gif", save_all=True, append_images=images, duration=times, loop=0, optimize=True)
     return file.getvalue()
 
 

@@ -288,10 +288,14 @@ README = ROOT / "README.md"
 def test_a_frame_shows_both_sides_and_the_picture_moves():
     frames = [*picture.frames(time=60.0)]
     assert {frame.shape for frame in frames} == {(picture.SIZE[1], 2 * picture.SIZE[0], 3)}
-    assert len(frames) == 12 // picture.EVERY
+    assert len(frames) == 12 // picture.EVERY + 1
     assert np.abs(frames[0].astype(int) - frames[-1]).max() > 100
     with Image.open(io.BytesIO(picture.moving(frames))) as image:
-        assert (image.format, image.n_frames) == ("GIF", len(frames))
+        assert (image.format, image.n_frames) == ("GIF", len(frames) + 1)
+        first, length = np.asarray(image.convert("RGB")), image.info["duration"]
+        image.seek(image.n_frames - 1)
+        assert length == image.info["duration"] == 2000
+        assert np.array_equal(first, np.asarray(image.convert("RGB")))  # the end stands first, and stays
 
 
 def test_the_committed_results_fill_pages_and_pictures_again(tmp_path, monkeypatch):

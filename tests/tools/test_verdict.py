@@ -257,6 +257,16 @@ def test_the_plot_shows_all_whom_the_finding_names():
         assert {*named} - {each.name for each in cases} <= {*words}
 
 
+def test_the_plot_shows_pids_as_such_and_the_share_that_one_loses():
+    """They have places beside the others; one far off has its number."""
+    names_of = ["paper", *vector.PIDS, *"abcdefgh"]
+    who = [(contender(name), {"rmse_mm": [0.1] * 4, "failure_rate": [0.0] * 4}) for name in names_of]
+    who[1] = contender(vector.PIDS[0]), {"rmse_mm": [9.0] * 4, "failure_rate": [0.0, 1.0, 1.0, 0.0]}
+    benchmark = made(find_case("randomized"), *who)
+    words = [each.text for each in ElementTree.fromstring(vector.result(benchmark)).iter(f"{SVG}text")]
+    assert {"paper (PID)", *vector.PIDS, "50 % lost, 9 →"} <= {*words}
+
+
 def test_the_crystal_that_pictures_show_is_usual_for_every_controller():
     """Not the first, where one was lucky, and not the last, which the agent lost."""
     paper, agent = contender("paper"), contender("a", training_seeds=(0, 1))

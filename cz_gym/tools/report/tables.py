@@ -169,10 +169,10 @@ def firsts(benchmark: "Benchmark") -> list[Contender]:
     return [*found, *(min(told, key=lambda each: benchmark.rank([case], each.name)) for case in cases if told)]
 
 
-def in_one_look(benchmark: "Benchmark") -> list[Contender]:
-    """Return the controllers of :func:`chosen` and of :func:`firsts`, which the finding names, in their order."""
+def in_one_look(benchmark: "Benchmark", more: Sequence[str] = ()) -> list[Contender]:
+    """Return, in their order, those of :func:`chosen`, of :func:`firsts`, which the finding names, and ``more``."""
     names = [each.name for each in (*chosen(benchmark, deciding(benchmark)[0], NAMED), *firsts(benchmark))]
-    return [each for each in benchmark.contenders if each.name in names]
+    return [each for each in benchmark.contenders if each.name in (*names, *more)]
 
 
 def typical(benchmark: "Benchmark", case: Case) -> int:

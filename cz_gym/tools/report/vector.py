@@ -14,7 +14,7 @@ from cz_gym.evaluation.statistics import Estimate
 from cz_gym.puller.file import DEFAULT
 from cz_gym.tools.episodes import Benchmark
 
-from .tables import PULL_STEP, RMSE, deciding, in_one_look, looks_of
+from .tables import FAILURES, PULL_STEP, RMSE, deciding, in_one_look, looks_of
 
 WIDTH = 640.0
 """Width of a picture [px]: its words can be read on a phone too, where it is drawn at about half of that."""
@@ -22,8 +22,12 @@ FAR = 30.0
 """Values beyond this multiple of the least one stand at an axis's end, with their number [-]."""
 LONGEST = 20
 """Longest name that there is room for [characters]."""
-PLAIN = {"randomized": "randomized (usual)"}
-"""Scenarios in plain words."""
+PLAIN = {"randomized": "randomized (usual)", "paper": "paper (PID)", "paper-tuned": "paper-tuned (PID)"}
+"""Scenarios and controllers whose names do not say what they are."""
+PIDS = "pid-uncompensated", "pid-conventional"
+"""Controllers that the result shows beside the best: what a reader knows as a PID."""
+OFTEN = 0.05
+"""Share of crystals lost above which a row of the result says it [-]."""
 STYLE = "\n".join(
     (
         ".cz{font:18px system-ui,'Segoe UI',Roboto,'Helvetica Neue','Liberation Sans',Arial,sans-serif}"
@@ -135,7 +139,7 @@ LABELS, ROW, TOP = 208.0, 31.0, 68.0
 def result(benchmark: Benchmark) -> str:
     """Draw controllers as rows, their mean RMSE and its interval on a logarithmic axis, in the first two scenarios."""
     cases = deciding(benchmark)[:2]
-    shown = in_one_look(benchmark)
+    shown = in_one_look(benchmark, PIDS)
     looks = looks_of(benchmark)
     known = {(case.name, each.name): benchmark.get(case, each.name, RMSE.metric) for case in cases for each in shown}
     there = [found for found in known.values() if found]
@@ -150,11 +154,13 @@ def result(benchmark: Benchmark) -> str:
         head = text(axis.start, TOP - 12.0, PLAIN.get(case.name, case.name), class_="faint", font_size="17")
         parts += [head, *_scale(axis, TOP, bottom)]
         for row, each in enumerate(shown):
+            share = benchmark.get(case, each.name, FAILURES.metric)
             parts += _row(
-                axis, TOP + (row + 0.5) * ROW, known[case.name, each.name], looks[each.name], is_told(each, case)
+                axis, TOP + (row + 0.5) * ROW, known[case.name, each.name], share, looks[each.name], is_told(each, case)
             )
     for row, each in enumerate(shown):
-        parts += [text(LABELS - 4.0, TOP + (row + 0.5) * ROW + 5.5, short(each.name), "end")]
+        name = PLAIN.get(each.name, each.name)
+        parts += [text(LABELS - 4.0, TOP + (row + 0.5) * ROW + 5.5, short(name), "end")]
     told = "which scenario it meets" if any(each.told for each in shown) else "what no sensor shows"
     hollow = any(is_told(each, cases[0]) for each in shown)
     notes = ["mean of all crystals, lost ones included"]
@@ -178,13 +184,15 @@ def _scale(axis: Axis, top: float, bottom: float) -> list[str]:
     return parts
 
 
-def _row(axis: Axis, y: float, found: Estimate | None, look: Style, told: bool) -> list[str]:
-    """A controller's line, with its mark and interval, or its number where the axis does not reach."""
+def _row(axis: Axis, y: float, found: Estimate | None, share: Estimate | None, look: Style, told: bool) -> list[str]:
+    """A controller's line, with its mark and interval, or its number and share lost where the axis does not reach."""
     parts = [line(axis.start, y, axis.end, y, "grid")]
     if found is None:
         return parts
     if not axis.holds(found.mean):
-        return [*parts, text(axis.end, y + 5.0, f"{found.mean:.3g} →", "end", class_="faint")]
+        often = f"{share.mean:.0%} lost, " if share and share.mean > OFTEN else ""
+        said = f"{often}{found.mean:.3g} →".replace("%", " %")
+        return [*parts, text(axis.end, y + 5.0, said, "end", class_="faint", font_size="16")]
     low, high = found.ends
     return [*parts, bar(axis.at(low), y, axis.at(high), y, look), mark(axis.at(found.mean), y, look, told)]
 
