@@ -29,7 +29,7 @@ from cz_gym.support.command_line import between
 from cz_gym.support.files import write_files
 from cz_gym.support.units import HOUR
 from cz_gym.tools.export.controllers import Agent
-from cz_gym.tools.registry import make_controller
+from cz_gym.tools.registry import agent_hash, make_controller
 from cz_gym.tools.report.tables import ROBUSTNESS, ROBUSTNESS_MEANS, beyond, markdown
 from cz_gym.tools.report.task_records import contract_hash
 
@@ -161,7 +161,10 @@ def _main(given: argparse.Namespace) -> None:
         io.StringIO(),
     )
     csv.writer(table, lineterminator="\n").writerows(
-        [("controller", *ROBUSTNESS, "contract"), *((*line, contract_hash([SCENARIO])) for line in lines)]
+        [
+            ("controller", *ROBUSTNESS, "contract", "agent"),
+            *((*line, contract_hash([SCENARIO]), agent_hash(line[0])) for line in lines),
+        ]
     )
     write_files({given.out / "table.md": text.encode(), given.out / "robustness.csv": table.getvalue().encode()})
 

@@ -9,7 +9,7 @@ from inspect import signature
 from pathlib import Path
 from textwrap import wrap
 
-from cz_gym.agents import shipped_names, shipped_seeds
+from cz_gym.agents import shipped, shipped_names, shipped_seeds
 from cz_gym.agents.contract import OnnxPolicy, read_agent
 from cz_gym.agents.residual import Base
 from cz_gym.baselines import tuned_controllers as tuned
@@ -170,6 +170,11 @@ def load_agent(path: str | Path, puller: PullerFile | None = None, controllers: 
         raise CzError(f"{path}: adds to the controller {name}: name its file too, --controller FILE.py:NAME")
     config = make_config("randomized", puller=puller, control_interval=contract.control_interval)
     return OnnxPolicy.load(path, base=make_base(place, config))
+
+
+def agent_hash(name: str) -> str:
+    """Hash of the shipped agent file that this name loads (12 hex digits); empty for a controller."""
+    return read_agent(shipped(name))[0].hash[:12] if name in shipped_names() else ""
 
 
 # The names that commands take, each with the line that its registry has on it.

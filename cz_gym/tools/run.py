@@ -31,7 +31,8 @@ from cz_gym.support.errors import CzError, software
 from cz_gym.support.files import check_writable, name_file_in_errors, write_files
 
 from .episodes import CODE, CONTRACT, GAPS, KEYS, Benchmark, read_episodes, read_estimates, to_csv, values_of
-from .report.tables import NAMED, chosen, typical
+from .registry import agent_hash
+from .report.tables import NAMED, ROBUSTNESS, chosen, typical
 from .report.task_records import TASKS, TaskRecord, contract_hash, task_of
 
 PRINTED = 1e-4
@@ -258,12 +259,13 @@ def earlier_bound(
 
 
 def earlier_robustness(file: Path) -> dict[str, tuple[str, ...]]:
-    """Return the figures of ``studies.robustness`` by controller; none of another contract."""
+    """Return the figures of ``studies.robustness`` by controller; none of another contract or agent file."""
     if not file.is_file():
         return {}
-    _, *lines = csv.reader(file.read_text("utf-8").splitlines())
+    rows = [row for row in csv.DictReader(file.read_text("utf-8").splitlines()) if {"contract", "agent"} <= row.keys()]
     contract = contract_hash([find_case("randomized", TASKS["Cz-v0"].cases)])
-    return {name: tuple(figures) for name, *figures, measured_on in lines if measured_on == contract}
+    current = [row for row in rows if (row["contract"], row["agent"]) == (contract, agent_hash(row["controller"]))]
+    return {row["controller"]: tuple(row[name] for name in ROBUSTNESS) for row in current}
 
 
 def _agree(now: pd.DataFrame, then: pd.DataFrame) -> bool:

@@ -21,7 +21,9 @@ from cz_gym.evaluation import protocol
 from cz_gym.evaluation.protocol import CASES, TRAINING_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.tools import leaderboard
+from cz_gym.tools.registry import agent_hash
 from cz_gym.tools.report.task_records import contract_hash
+from cz_gym.tools.run import earlier_robustness
 from studies import cards, frontier, picture, ranks, robustness, speed, stock
 from tests.conftest import ROOT
 
@@ -239,6 +241,20 @@ def test_an_altered_policy_scales_the_pull_and_holds_its_setpoints_back(name):
     v_0 = config.parameters.v_0
     np.testing.assert_array_equal(late.v_p[:3], v_0)
     np.testing.assert_allclose(late.v_p[3] - v_0, 2.0 * (plain.signals.v_p[0] - v_0), rtol=1e-3, atol=1e-6 * v_0)
+
+
+def test_a_report_shows_robustness_of_this_contract_and_of_these_agent_files(monkeypatch, tmp_path):
+    monkeypatch.setattr(robustness, "robustness", lambda *_: (2.0, 0.5, 5.0))
+    assert robustness.main(["lqg", "gradient", "--out", str(tmp_path)]) == 0
+    file = tmp_path / "robustness.csv"
+    both = {"lqg": ("2", "0.5", "5"), "gradient": ("2", "0.5", "5")}
+    assert earlier_robustness(file) == both
+    hashes = contract_hash([robustness.SCENARIO]), agent_hash("gradient")
+    for old, left in zip(hashes, ({}, {"lqg": both["lqg"]}), strict=True):
+        other = tmp_path / "other.csv"
+        other.write_text(file.read_text().replace(old, "0123456789ab"))
+        assert earlier_robustness(other) == left
+    assert set(robustness.CONTROLLERS) >= set(earlier_robustness(ROOT / "results" / "robustness" / "robustness.csv"))
 
 
 # Ranks under moved estimates, and the limit
