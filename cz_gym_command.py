@@ -15,7 +15,7 @@ from threading import Timer
 
 COMMANDS = {
     "list": ("cz_gym.tools.registry", "names of controllers, agents, scenarios, pullers, stages"),
-    "train": ("cz_gym.tools.train", "train an agent by a recipe"),
+    "train": ("cz_gym.tools.train", "train an agent by a training recipe"),
     "benchmark": ("cz_gym.tools.benchmark", "compare controllers and agents on the same crystals"),
     "tune": ("cz_gym.tools.tune", "search settings of controllers, or design them for a puller"),
     "check": ("cz_gym.tools.check", "check an agent or a controller before a run"),

@@ -216,5 +216,16 @@ def test_it_is_dark_when_asked_and_prints_whole_tables(report):
     resize(report, 1280)
 
 
+def test_the_player_prints_on_one_page(report):
+    """On A4 across, which holds 277 by 190 mm."""
+    report.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print", "features": []})
+    resize(report, round(277 / 25.4 * 96))
+    top = "[...document.querySelectorAll('h2.pictures')].at(-1).getBoundingClientRect().top"
+    tall = report.execute_script(f"return document.getElementById('sides').getBoundingClientRect().bottom - {top}")
+    report.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "", "features": []})
+    resize(report, 1280)
+    assert 0 < tall <= 190 / 25.4 * 96
+
+
 def test_the_browser_logged_no_error(report):
     assert [line for line in report.get_log("browser") if line["level"] != "INFO"] == []

@@ -235,8 +235,12 @@ def test_the_finding_tells_those_who_are_told_apart_and_says_how_much_each_moves
         "drives: 0.2010 against 0.4020 on `randomized`; 0.2010 against 0.4020 on `hard`. Told the scenario, the best "
         "are `told` on `randomized` (0.1005) and `told` on `hard` (0.1005). Radius error on `randomized`: `agent` "
         "0.800, `free` 0.600, `told` 0.900 mm (RMSE); from sample to sample, their pull speed changes by 0.3000, "
-        "0.2000 and 0.5000 mm/min (RMS)."
+        "0.2000 and 0.5000 mm/min (RMS). No learned agent lost a crystal."
     )
+    who[3][1]["failure_rate"] = [0.0] * 19 + [1.0]
+    said = "Learned agents lose at most 5.00 % of the crystals of a scenario (`agent` on `randomized`)."
+    assert finding(made(cases, *who)).endswith(said)
+    who[3][1].pop("failure_rate")
     assert finding(made(cases, *who[1:])) == ""
     close = finding(made(cases, *who[:3], (who[3][0], steps(0.399, 0.3))))
     assert "on `hard` (intervals overlap). Told" in close

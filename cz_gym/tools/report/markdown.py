@@ -181,8 +181,21 @@ def finding(benchmark: Benchmark) -> str:
         f"{kinds[1]} of them is `{other.name}`. Mean cost, which counts the radius error and the moves of both "
         f"drives: {'; '.join(pairs)}. Told the scenario, the best are {' and '.join(aware)}. Radius error on "
         f"`{cases[0].name}`: {', '.join(errors)} mm (RMSE); from sample to sample, their pull speed changes by "
-        "{}, {} and {} mm/min (RMS).".format(*moves)
+        "{}, {} and {} mm/min (RMS). ".format(*moves)
+        + _lost_by_agents(benchmark)
     )
+
+
+def _lost_by_agents(benchmark: Benchmark) -> str:
+    """Say how many crystals learned agents lose at most on a random scenario, and which of them does."""
+    share, agents = tables.FAILURES._replace(interval=False), [each for each in benchmark.contenders if each.learned]
+    lost = {(case, each.name): benchmark.mean(case, each.name, share.metric)
+            for case in tables.deciding(benchmark) for each in agents if not each.bound}  # fmt: skip
+    case, name = max(lost, key=lambda key: lost[key])
+    if not lost[case, name]:
+        return "No learned agent lost a crystal."
+    most = share.of(benchmark, case, name)
+    return f"Learned agents lose at most {most} % of the crystals of a scenario (`{name}` on `{case.name}`)."
 
 
 def _against(benchmark: Benchmark, case: Case, best: Contender, other: Contender, cost: tables.Column) -> str:
