@@ -25,7 +25,7 @@ CHANNELS, REPEAT, GAMMA, CLIP = 73, 4, 0.99, 0.2
 
 @dataclass
 class Budget:
-    """What a training may take: minutes of processor time, and crystals at once."""
+    """Limits of a training: minutes of processor time, and crystals at once."""
 
     minutes: float
     crystals: int = 1024
@@ -133,7 +133,7 @@ def cleanrl(budget: Budget, seed: int = 0) -> nn.Module:
 
 
 def skrl(budget: Budget, seed: int = 0) -> nn.Module:
-    """Its agent, memory and trainer: the scaler of observations and the policy's network go into the module."""
+    """Agent, memory and trainer of skrl: the scaler of observations and the policy's network go into the module."""
     from gymnasium.wrappers.vector import NormalizeReward
     from skrl.agents.torch.ppo import PPO
     from skrl.envs.wrappers.torch import wrap_env

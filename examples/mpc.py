@@ -74,7 +74,7 @@ class MPC(LQG):
 
     @property
     def stage(self) -> ca.Function:
-        """One sample: from z, and correction with data, to the new z, and drives with their moves."""
+        """Advance one sample: from z, and correction with data, to the new z, and drives with their moves."""
         puller, law, n = self.gains.filter.puller, self.gains.regulator, PLANT + 2
         nominal = np.array([*puller.state_0, *puller.inputs_0])
         K = np.hstack([law.feedback[:, :PLANT], law.feedback[:, -2:]]) * SCALE / SCALE[PLANT:, None]

@@ -72,7 +72,7 @@ class Actor(nn.Module):
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> Any:
-        """As every policy's: actions for observations."""
+        """Return actions for observations, as every policy does."""
         with torch.no_grad():
             action = self.unit * self((torch.as_tensor(observation) - self.mean) / self.spread)
         return action.clamp(-1.0, 1.0).numpy(), state
@@ -138,7 +138,7 @@ def td3_bc(steps: Steps, make: Callable[[], Actor]) -> Actor:
 
 
 def descend(optimiser: torch.optim.Optimizer, loss: Any) -> None:
-    """One step of an optimiser."""
+    """Take one step of an optimiser."""
     optimiser.zero_grad()
     loss.backward()
     optimiser.step()

@@ -46,7 +46,7 @@ class Row(NamedTuple):
     python: Sequence[float]
     """Python's row of the table: RMSE [mm] and pull step RMS [mm/min], rounded as there; crystals lost."""
     c: Sequence[float]
-    """The same row with the C."""
+    """Those figures with the C in place of Python."""
     rounded: Sequence[float] | None = None
     """Row, where it differs, of C in double precision whose setpoints alone are rounded to single precision."""
 
@@ -62,8 +62,8 @@ def rounded(runner: Runner) -> Any:
 
 
 def with_same_readings(block: Block, others: Sequence[Runner]) -> tuple[Any, Any]:
-    """A block that gives others its readings and its setpoints; and the largest differences of their actions, which it
-    keeps.
+    """Make a runner of the block that has the others act on its readings and setpoints; return it, and the array in
+    which it keeps the largest difference of each one's actions.
     """
     runners, worst = (block, *others), np.zeros(len(others))
 

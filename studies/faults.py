@@ -36,13 +36,13 @@ from . import StudyParser
 
 CONTROLLERS, CRYSTALS = ("lqg-at-0.02", "paper-tuned", "fallback", "gradient"), 100
 GONE = 0.5 * HOUR, 2.5 * HOUR
-"""When a pyrometer is gone [s]."""
+"""Beginning and end of the time without a pyrometer [s]."""
 STILL = 1.0 * HOUR, 1.0 * HOUR + 10.0 * MINUTE
-"""When the drives stand still [s]."""
+"""Beginning and end of the time in which the drives stand still [s]."""
 OFF = {"nominal_heater_power_kW": 2.0, "nominal_T_1_K": 10.0, "nominal_radius_mm": 0.2}
 """Errors of the nominal values."""
 STEP = 0.75 * HOUR
-"""When the ring steps or gets stuck [s]."""
+"""Time at which the ring steps or gets stuck [s]."""
 FULL, STEPS = (2.4, 20.0), (0.01, 0.1)
 """Full ranges of pull speed [mm/min] and heater power [kW], and largest resolutions of their readings."""
 DRIVES = tuple(SETPOINT_NAMES.values())
@@ -92,11 +92,11 @@ class Fault(NamedTuple):
     reads: tuple[Reading, Reading] | None = None
     """Errors of the readings of pull speed [mm/min] and heater power [kW]."""
     delay: int = 0
-    """Age of both, in intervals of the block."""
+    """Age of both readings [control intervals of the block]."""
     ring: Callable[[Any, Any], Any] | None = None
     """The ring from :data:`STEP` on, from the true one [mm] and the last one before."""
     ring_ends: float = math.inf
-    """When it is true again [s]."""
+    """Time at which the ring is read right again [s]."""
     drift: float = 0.0
     """Drift of the pyrometer [K/h]."""
 

@@ -83,7 +83,7 @@ def _crystal(config: Config, seed: int) -> dict[str, Any]:
 
 
 def _recordings(config: Config, seeds: Sequence[int], name: str) -> list[dict[str, Any]]:
-    """How a controller grew each crystal: curves of its true radius error and pull speed, RMSE and cost so far."""
+    """Curves of a controller on each crystal: true radius error, pull speed, RMSE and cost so far."""
     run = rollout(make_controller(name, config), config, seeds)
     final, error, s = metrics(run), radius_error(run), run.signals
     limit = config.process.cost_terms(signals.Cost(config.radius_limit, 0.0, 0.0, 0.0), config.weights).radius

@@ -202,7 +202,7 @@ def ranked(moved: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
 
 
 def figure(moved: Mapping[str, Mapping[str, Any]]) -> bytes:
-    """One figure: the radius error of each controller under each moved estimate, lost crystals as large errors."""
+    """Draw the radius error of each controller under each moved estimate, lost crystals as large errors."""
     drawing, abouts = canvas(8.0, 4.6), list(moved)
     axes, looks = drawing.add_subplot(), styles(list(next(iter(moved.values()))))
     for name, look in looks.items():

@@ -40,7 +40,7 @@ CONTROLLERS = (
     "gradient", "ppo", "sac", "ppo-plain",
 )  # fmt: skip
 SCENARIO = find_case("randomized", CASES)
-"""Its drives follow at once, and their readings are exact."""
+"""Scenario of the study: drives follow at once, and their readings are exact."""
 FACTORS = tuple(float(f"{each:.2f}") for each in np.geomspace(1.1, 4.0, 8))
 """Factors on the pull's effect, and divisors of it [-]."""
 SAMPLES = tuple(range(1, 17))
@@ -104,7 +104,7 @@ def policy_and_config(name: str, scenario: str, hours: float) -> tuple[Any, Conf
 
 
 def with_setpoints(name: str, hours: float) -> tuple[Any, Config]:
-    """The same on :data:`SCENARIO`, with actions that are setpoints."""
+    """Return the policy and the environment on :data:`SCENARIO`, with setpoints as actions."""
     policy, config = policy_and_config(name, SCENARIO.name, hours)
     if name not in shipped_names():
         return policy, config

@@ -215,10 +215,10 @@ def main(argv: list[str] | None = None) -> int:
     parser = OneLineParser(prog="python -m studies.speed", description="Measure speed beside installed peers.")
     parser.add_argument("--quick", action="store_true", help="fewer repeats: under 40 s")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures here")
-    return parser.run(_measure, argv, "benchmark")
+    return parser.run(_main, argv, "benchmark")
 
 
-def _measure(arguments: argparse.Namespace) -> None:
+def _main(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
         check_writable(arguments.json.parent)
     result = measure(cases(), QUICK if arguments.quick else FULL)

@@ -38,7 +38,7 @@ class Learner(NamedTuple):
     crystals: int
     """Number of crystals at a time."""
     algorithm: str = "ppo"
-    """Its name, as ``python -m cz_gym.agents.from_sb3 --algo`` knows it."""
+    """Name of the algorithm, as ``python -m cz_gym.agents.from_sb3 --algo`` knows it."""
     policy: str = "MlpPolicy"
     observation: str = "history"
     action_repeat: int = 1

@@ -1,4 +1,4 @@
-"""``cz-gym check FILE``: whether an agent or a controller fits an environment, before a run."""
+"""``cz-gym check FILE``: check that an agent or a controller fits an environment, before a run."""
 
 import argparse
 import pickle
@@ -76,7 +76,7 @@ def _loaded(given: argparse.Namespace) -> tuple[Any, Config]:
 
 
 def _declared(contract: Contract) -> list[tuple[str, str]]:
-    """What a contract says that nothing measures."""
+    """Facts of a contract that are taken from it, not measured."""
     told = f"{contract.training_steps:,} steps, seed {contract.training_seed}, {GROUPS.get(contract.learned_from, '?')}"
     cost = f"RMSE {contract.validation_rmse_mm:.3f} mm, cost {contract.validation_cost:.4g} on its maker's validation"
     return [
@@ -97,11 +97,15 @@ def check_calls(policy: Any, config: Config) -> list[tuple[str, str]]:
     for step in range(STEPS):
         before = observation.copy()
         action, state = call_policy(policy, observation, state, begins)
-        _check_action(action, observation, before, step)
+        array = np.asarray(action)
+        if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+            raise CzError(f"step {step}: its actions are not finite numbers: {array[:3].tolist()}")
+        if not np.array_equal(observation, before, equal_nan=observation.dtype.kind == "f"):
+            raise CzError(f"step {step}: it writes into the observations that it is given")
         one, seconds = alone.act(policy, observation[:1], begins[:1])
         took.append(seconds)
-        largest = max(largest, float(np.abs(one[0] - np.asarray(action)[0]).max()))
-        observation, _, terminated, truncated, _ = env.step(np.asarray(action))
+        largest = max(largest, float(np.abs(one[0] - array[0]).max()))
+        observation, _, terminated, truncated, _ = env.step(array)
         begins = terminated | truncated
     memory, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
@@ -131,15 +135,6 @@ class _Alone:
         before = time.perf_counter()
         action, self.state = call_policy(policy, observation, self.state, begins)
         return np.asarray(action), time.perf_counter() - before
-
-
-def _check_action(action: Any, observation: Any, before: Any, step: int) -> None:
-    """Raise CzError for actions that are no numbers, and for a policy that writes into observations."""
-    array = np.asarray(action)
-    if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
-        raise CzError(f"step {step}: its actions are not finite numbers: {array[:3].tolist()}")
-    if not np.array_equal(observation, before, equal_nan=observation.dtype.kind == "f"):
-        raise CzError(f"step {step}: it writes into the observations that it is given")
 
 
 def _check_beginning(policy: Any, observation: Any, state: Any) -> None:

@@ -132,7 +132,7 @@ def pid_numbers(puller: PullerFile) -> str:
 
 
 def _numbers_of(controller: Any, config: Config) -> dict[str, str]:
-    """One PID by the names of its numbers."""
+    """Numbers of one PID, by name."""
     form, compensator = StandardPID.of(controller.pid), controller.compensator
     P, I, D = form.parallel()
     error = metrics(rollout(controller, config, VALIDATION_SEEDS[:CRYSTALS])).rmse_mm

@@ -1,4 +1,4 @@
-"""``cz-gym recipe``: the set points of a whole crystal against its length, what an operator loads."""
+"""``cz-gym recipe``: the set points of a whole crystal against its length, as an operator loads them."""
 
 import argparse
 from collections.abc import Sequence

@@ -142,7 +142,7 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
 
 
 def search_for(task: Task) -> Trial:
-    """One search for a puller."""
+    """Search for a puller; the task of a process."""
     tuned, puller, trials, episodes, margins, folder = task
     config = tuned.search_config(RANDOMIZED, puller=puller)
     search = Search(tuned.name, tuned.objective_on(config), config, trials, episodes, quick=True, margins=margins)

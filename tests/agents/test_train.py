@@ -9,6 +9,8 @@ import os
 import signal
 import sys
 from dataclasses import asdict, replace
+from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,6 +31,7 @@ from cz_gym.tools import train
 from cz_gym.tools.registry import make_base, make_controller
 from tests.small_learners import QUICK, REFERENCES, SMALL, SMALL_APG, SMALL_SAC, SmallRun, learned, train_small, trained
 
+measure_references = recipes.references
 ALONG = {name: getattr(CRYSTAL_RECIPES["ppo"], name) for name in ("environment", "stages", "scenario")}
 SMALL_PPO = replace(QUICK, steps=4096, control_interval=30.0)
 
@@ -94,8 +97,15 @@ def test_a_resumed_sac_keeps_its_temperature_and_fills_a_new_replay_buffer_befor
     assert other._n_updates == 1
 
 
+@cache
+def references_once(make, config):
+    """The measured references of an environment, whatever the recipe is."""
+    return measure_references(make, SimpleNamespace(config=config))
+
+
 @pytest.fixture
 def quick(monkeypatch, few_crystals):
+    monkeypatch.setattr(recipes, "references", lambda make, recipe: references_once(make, recipe.config))
     monkeypatch.setitem(RECIPES, "ppo", QUICK)
     monkeypatch.setitem(CRYSTAL_RECIPES, "ppo", replace(QUICK, name="ppo-along", **ALONG))
     for known in (RECIPES, CRYSTAL_RECIPES):

@@ -1,5 +1,7 @@
 """Datasets: stock Minari reads them, each episode can be made again, and what is wrong is said in one line."""
 
+from functools import cache
+
 import minari
 import numpy as np
 import pytest
@@ -174,6 +176,7 @@ def test_only_training_seeds_are_recorded(seeds):
 
 
 def test_a_dataset_is_replaced_only_when_asked_for_and_never_left_half(place, monkeypatch, capsys):
+    monkeypatch.setattr(datasets, "reference_scores", cache(datasets.reference_scores))
     command = ["--policies", "paper", "--scenarios", "nominal", "--episodes", "1", "--out", str(place)]
     assert main(command) == 0
     assert "cz/nominal/paper-v0: 1 episodes, 2,160 steps" in capsys.readouterr().out

@@ -40,7 +40,7 @@ class Alarm(IntFlag):
     DRIVES = 4
     """An applied drive is no number or outside its range; the last setpoint is held."""
     REFERENCE = 8
-    """The same of a reference or its preview; the last good one is held."""
+    """A reference or its preview is no number or outside its range; the last good one is held."""
     LATE = 16
     """The call came more than a tenth of the control interval late."""
     CLOCK = 32
@@ -293,7 +293,7 @@ class Memory(NamedTuple):
     last_ring: Any
     """Last ring, good or not, above nominal [m]."""
     ring_still_time: Any
-    """Time for which it has not changed [s]."""
+    """Time for which the ring has not changed [s]."""
     no_ring_time: Any
     """Time without a good ring, but for its steps [s]."""
     ring_level: Any
@@ -303,7 +303,7 @@ class Memory(NamedTuple):
     ring_step: Any
     """Mean of a step that has not yet stayed [m]."""
     ring_step_time: Any
-    """Time for which it has stayed [s]."""
+    """Time for which the step has stayed [s]."""
     radius_time: Any
     """Time for which the radius has been beyond its limit [s]."""
     readings: Measured
@@ -360,7 +360,7 @@ class Ring(NamedTuple):
     good: Any
     """True if the ring is good."""
     error: Any
-    """Its distance from the reference, without its steps [m]."""
+    """Distance of the ring from the reference, without the ring's steps [m]."""
     stepped: Any
     """True if it has jumped by more than a crystal can."""
     last: Any
@@ -468,7 +468,7 @@ class Drive(NamedTuple):
     """One drive at a sample, in the unit of its port."""
 
     known: Any
-    """True if its reading is good."""
+    """True if the reading of the drive is good."""
     applied: Any
     """The reading; without a good one the last setpoint."""
     held: Any
@@ -482,13 +482,13 @@ class Drive(NamedTuple):
     span: tuple[Any, Any]
     """Range of its setpoint."""
     sent: Any
-    """The setpoint that it had until this call."""
+    """Setpoint of the drive until this call."""
     difference: Any
-    """Its reading minus that setpoint, averaged."""
+    """Reading minus the setpoint until this call, averaged."""
     error: Any
-    """The part of it that counts as an error of the reading."""
+    """Part of the difference that counts as an error of the reading."""
     errs: Any
-    """True if that is large enough to tell."""
+    """True if the error is large enough to raise a bit."""
 
     @property
     def away(self) -> Any:

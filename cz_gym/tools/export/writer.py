@@ -79,7 +79,7 @@ SYNTAX = {
     "place": ("{1} *const {0} = block->work.{0};", ""),
     "bit": ("#define {BLOCK}_{0} {1}u /* {2} */", "{1}: {2}"),
 }
-"""How C99 and structured text write operations, statements and declarations.
+"""Operations, statements and declarations in C99 and in structured text.
 
 A loop runs over ``{0}`` from 0 to ``{1}``, which is not included, or ``{2}``, which is.
 """

@@ -1,4 +1,4 @@
-"""Maximum a posteriori of the filter's prediction errors: what a log tells of a puller, and whether the model fits.
+"""Maximum a posteriori estimate of a puller's numbers from its logs, by the filter's prediction errors.
 
 Prediction errors, operating point and noise at the maximum say whether the model fits the log.
 """
@@ -115,7 +115,7 @@ class Identified:
     sds: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations of the priors by name."""
     told_sds: tuple[str, ...] = ()
-    """Names of those that were told, in place of handbooks' and the usual ones."""
+    """Names of the priors that the user gave, in place of handbooks' and the usual ones."""
     misfits: tuple[str, ...] = ()
     """Reasons why the model does not fit the log, in words; empty if it does."""
     posterior: Posterior | None = None

@@ -85,12 +85,8 @@ def read_fields(path: Path, wanted: set[str], notes: dict[str, int]) -> Any:
         lines = _decoded(path.read_bytes()).rstrip("\0 \t\r\n").split("\n")
         wanted |= {part for name in wanted for part in name.split("+")}
         places = [(n, separator) for n in range(min(len(lines), TOP)) for separator in ",;\t|"]
-
-        def matches(place: tuple[int, str]) -> tuple[int, int]:
-            fields = _fields(lines[place[0]], place[1])
-            return len(wanted & set(fields)), len(fields)
-
-        top, separator = max(places, key=matches, default=(0, ","))
+        fields = {place: _fields(lines[place[0]], place[1]) for place in places}
+        top, separator = max(fields, key=lambda at: (len(wanted & set(fields[at])), len(fields[at])), default=(0, ","))
         names = _fields(lines[top].rpartition("\0")[2].lstrip("# "), separator)
         whole, rows, lost = _sound_lines(lines[top:], len(names), separator)
         notes["rows are lost in NUL bytes, as after a power failure"] = lost
@@ -287,7 +283,11 @@ def _read_times(text: Any, unit: str) -> tuple[Any, bool]:
         naive = bool(parts[["sign", "zone"]].isna().all(axis=None))
         return _seconds(parts, 999.0) + DAY * parts["D"].astype(float).fillna(0.0), naive
     plain = text.str.replace(_COMPACT, r"\1T\2", regex=True)
-    plain = plain.str.replace(rf"^[^\W\d_]{{2,10}}\.?,? +(?=\d|{_WORD})", _no_weekday, regex=True)
+    plain = plain.str.replace(
+        rf"^[^\W\d_]{{2,10}}\.?,? +(?=\d|{_WORD})",
+        lambda found: found[0] if found[0][:3].lower() in MONTH else "",
+        regex=True,
+    )
     in_c = (
         rf"^({_WORD}) +(\d{{1,2}}) (\d{{1,2}}:\d{{2}}:\d{{2}})((?: \w{{1,4}})?) (\d{{4}})$"  # Sun Mar  1 12:00:05 2026
     )
@@ -311,10 +311,6 @@ def _read_times(text: Any, unit: str) -> tuple[Any, bool]:
         times[at] = days + clock
         naive &= bool(parts[["sign", "zone"]].isna().all(axis=None))
     return times, naive
-
-
-def _no_weekday(match: re.Match[str]) -> str:
-    return match[0] if match[0][:3].lower() in MONTH else ""
 
 
 def _seconds(parts: Any, most: float = 24.0) -> Any:
@@ -703,7 +699,10 @@ def read_log(
             table[name] = parse_column(file[column][seconds.index], name, own, notes)
         notes["numbers are infinite"] = int(np.isinf(table.to_numpy()).sum())
         table = table.replace([np.inf, -np.inf], np.nan)
-        _name_camera_clock(table, notes)
+        late = (table["time_s"] - table["frame_time_s"]).median()
+        if abs(late) >= CLOCK_OFF:
+            told = "" if late < 0.0 else ", or its frames are that old (latency_s of the puller file)"
+            notes[f"the camera's clock is {abs(late):.3g} s {'ahead' if late < 0.0 else 'behind'}{told}"] = True
         name_compression(table, notes)
         if hold:
             table = table.ffill()
@@ -744,14 +743,6 @@ def parse_column(field: Any, name: str, unit: str, notes: dict[str, int]) -> Any
         return _read_times(field.fillna("").str.strip(), unit)[0]
     factor, added = COLUMNS[name][unit]
     return parse_numbers(field, name, notes) * factor + added
-
-
-def _name_camera_clock(table: Any, notes: dict[str, int]) -> None:
-    """Note by how much the camera's clock is ahead of the rows' or behind."""
-    late = (table["time_s"] - table["frame_time_s"]).median()
-    if abs(late) >= CLOCK_OFF:
-        told = "" if late < 0.0 else ", or its frames are that old (latency_s of the puller file)"
-        notes[f"the camera's clock is {abs(late):.3g} s {'ahead' if late < 0.0 else 'behind'}{told}"] = True
 
 
 def add_log_options(parser: Any) -> None:

@@ -34,8 +34,9 @@ SHARE = 0.2
 FEW = 0.1
 """Share of the windows that do not count: those with the largest moves, which a reading may explain that is lost."""
 STEP, LASTS, LARGER, SEVERAL = 0.015, 0.7, 3.0, 3
-"""Among those, steps of a step test count: from this share of nominal on, of which the windows beside them leave that
-share, and larger than the other windows' moves by that factor, if there are several. A controller takes a kick back."""
+"""Steps of a step test, which count although they are among the largest moves: least size, as a share of nominal; share
+of it that must be left in the windows beside, since a controller takes a kick back; least ratio to the other windows'
+moves; least number of such steps."""
 PAST, MEANS = 6, (20.0, 60.0, 200.0, 600.0)
 """Last values of drive and readings that explain a move, and time constants of means that do, too [s]."""
 ROUNDS, EDGE = 30, 0.05

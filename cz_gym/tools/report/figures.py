@@ -70,7 +70,10 @@ def _by_length(benchmark: Benchmark, case: Case) -> bytes:
     """Draw a crystal's profile to scale, and its signals by length."""
     names = [each.name for each in chosen(benchmark, case, COLUMNS)]
     style, fate = looks_of(benchmark), {name: lost(benchmark, case, name) for name in names}
-    signals = {name: _thinned(benchmark.signals[case.name, name]) for name in names}
+    every = {name: benchmark.signals[case.name, name] for name in names}
+    signals: dict[str, Any] = {
+        name: type(s)(*(each[:: -(-len(s.L) // POINTS)] for each in s)) for name, s in every.items()
+    }
     longest = max(signals.values(), key=lambda s: s.L[-1])
     room = 1.1 * longest.r_ref.max() / MM
     ends = float(longest.L[0] / MM), float(longest.L[-1] / MM)
@@ -107,9 +110,3 @@ def _by_length(benchmark: Benchmark, case: Case) -> bytes:
         "dashed: the recipe", fontsize=10.5,
     )  # fmt: skip
     return png(figure)
-
-
-def _thinned(s: Any) -> Any:
-    """The signals at no more than :data:`POINTS` steps."""
-    step = -(-len(s.L) // POINTS)
-    return type(s)(*(signal[::step] for signal in s))

@@ -112,8 +112,12 @@ def page(benchmark: Benchmark, command: str) -> str:
     best = tables.best_of_each_kind(benchmark)
     shown = [each for each in contenders if each in best or each.name == REFERENCE]
     heads, groups = task.overview(benchmark.only(tables.deciding(benchmark), shown))
+    light, dark = (
+        "".join(f".{name}{{color:{shade(colour)}}}" for name, colour in COLOURS.items()) for shade in (str, lighter)
+    )
+    colours = f"{light}@media screen and (prefers-color-scheme:dark){{{dark}.recipe{{color:#fff}}}}"
     parts = {
-        "style": _asset("page.css") + _signal_colours() + vector.STYLE,
+        "style": _asset("page.css") + colours + vector.STYLE,
         "script": _asset("player.js"),
         "data": json.dumps(crystals(benchmark), separators=(",", ":")).replace("<", "\\u003c"),
         "verdict": escape(verdict.sentence),
@@ -186,13 +190,6 @@ def _table(heads: Iterable[str], rows: Iterable[Iterable[str]], kind: str = "fig
 def _cell(tag: str, text: str) -> str:
     first, _, below = text.partition(" [")
     return f"<{tag}>{escape(first)}{f'<small>[{escape(below)}</small>' if below else ''}</{tag}>"
-
-
-def _signal_colours() -> str:
-    """Style of the player's lines, on a light and on a dark ground."""
-    light = "".join(f".{name}{{color:{colour}}}" for name, colour in COLOURS.items())
-    dark = "".join(f".{name}{{color:{lighter(colour)}}}" for name, colour in COLOURS.items())
-    return f"{light}@media screen and (prefers-color-scheme:dark){{{dark}.recipe{{color:#fff}}}}"
 
 
 def _asset(name: str) -> str:

@@ -52,7 +52,7 @@ class Verdict(NamedTuple):
     sentence: str
     heads: tuple[str, ...] = ()
     rows: tuple[tuple[str, ...], ...] = ()
-    """One a scenario; empty if there is no verdict."""
+    """Rows of the table, one a scenario; empty if there is no verdict."""
 
 
 class Panel(NamedTuple):

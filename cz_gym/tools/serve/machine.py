@@ -350,7 +350,7 @@ class Machine:
 
     @property
     def over(self) -> bool:
-        """Whether the crystal has ended."""
+        """True if the crystal has ended."""
         return self._record.ending is not None
 
     def step(self) -> dict[str, Any]:
@@ -490,7 +490,7 @@ class CrystalMachine(Machine):
         return np.array([u.v_p / MM_PER_MIN, u.Q_H / KILO])
 
     def _settings(self) -> dict[str, Any]:
-        """Those of ``Cz-v0``, with the least and the largest drives that the recipe and their ranges allow."""
+        """Settings of ``Cz-v0``, with the least and the largest drives that the recipe and their ranges allow."""
         drives = (self._record.table[:, [_v_p, _Q_H]] + (0.0, self._record.episode.told_power)) / (MM_PER_MIN, KILO)
         reach = np.minimum(self._units, (self.config.puller.pull_room / MM_PER_MIN, np.inf))
         limits = np.maximum(drives.min(axis=0) - reach, 0.0), drives.max(axis=0) + reach

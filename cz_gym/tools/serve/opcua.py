@@ -362,7 +362,7 @@ class Page:
         return response
 
     def _is_served(self, given: str) -> bool:
-        """Whether a Host header names this server: an address, or a name that another site cannot point here."""
+        """True if a Host header names this server: an address, or a name that another site cannot point here."""
         host = ""
         try:
             host = urlsplit(f"//{given}").hostname or ""
