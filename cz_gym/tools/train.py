@@ -110,9 +110,10 @@ def train(arguments: argparse.Namespace) -> int:
     where = f"{recipe.environment} ({', '.join(recipe.stages)}), " if recipe.environment else ""
     crystals = {ALL.name: "all"}.get(recipe.config.scenario.name, recipe.config.scenario.name)
     print(f"{recipe.name}, {amount} on {where}{crystals}{machine}, into {arguments.out}", flush=True)
-    base = make_base(recipe.controller, recipe.config) if isinstance(recipe, PPOResidual) else None
-    if base and isinstance(recipe, PPOResidual):
-        Residual(base, *recipe.limits)  # refuses wrong limits before the work
+    base = None
+    if isinstance(recipe, PPOResidual):
+        base = make_base(recipe.controller, recipe.config)
+        Residual(base, *recipe.limits)  # wrong limits are refused before the work
     options = _measure_references(recipe), arguments.checkpoint_seconds, arguments.plot, callbacks, base
     runs = [TrainingRun(folder, recipe, seed, *options) for folder, seed in zip(folders, seeds, strict=True)]
     if not arguments.seeds:

@@ -36,8 +36,8 @@ from studies.export import LARGEST, report, study
 from studies.faults import FAULTS, grow
 from tests.tools.export.structured_text import FunctionBlock
 
-CLASSICAL = [entry.name for entry in controllers.CONTROLLERS if not entry.bound]
 CONTROLLERS = ("paper", "paper-tuned", "pid-conventional", "lqg", "gradient", "ppo")
+CLASSICAL = [entry.name for entry in controllers.CONTROLLERS if not entry.bound]
 needs_compiler = pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed: no C can be compiled")
 PULL, HEATER, ALARMS = "pull_speed_setpoint_mm_per_min", "heater_power_setpoint_kW", "alarms"
 
@@ -138,14 +138,10 @@ def test_an_exported_agent_acts_as_onnxruntime_does(name):
         seen, measured = own.step(np.asarray(action))[0], env.step(np.asarray(action))[0]
 
 
-FAST = [*((name, "puller") for name in CONTROLLERS), ("lqg-at-0.02", "sensor-fault")]
-SLOW = [("lqg", "sensor-fault"), ("lqg", "randomized")]
+FAST = [("paper-tuned", "puller"), ("gradient", "puller"), ("lqg-at-0.02", "sensor-fault")]  # one of each kind
 ELSEWHERE = {"lqg-robust": "randomized"}  # it was tuned there alone
-SLOW += [
-    (name, ELSEWHERE.get(name, "puller"))
-    for name in (*CLASSICAL, "fallback", *agents.shipped_names())
-    if name not in CONTROLLERS
-]
+SLOW = [(name, ELSEWHERE.get(name, "puller")) for name in (*CLASSICAL, "fallback", *agents.shipped_names())]
+SLOW = [case for case in (*SLOW, ("lqg", "sensor-fault"), ("lqg", "randomized")) if case not in FAST]
 
 
 @needs_compiler
@@ -401,7 +397,9 @@ SANITIZED = "-std=c99 -pedantic -Wall -Wextra -Werror -g -fsanitize=address,unde
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", [*CONTROLLERS[:3], pytest.param("lqg", marks=pytest.mark.slow), *CONTROLLERS[4:]])
+@pytest.mark.parametrize(
+    "name", [name if name in dict(FAST) else pytest.param(name, marks=pytest.mark.slow) for name in CONTROLLERS]
+)
 def test_the_c_is_clean_under_sanitizers_whatever_it_reads(name, tmp_path):
     block = block_of(name)
     assign = " ".join(f"m.{port.name} = x[{at}]{' > 0.5' * port.logical};" for at, port in enumerate(INPUTS))
@@ -723,7 +721,7 @@ def sample(given, past):
     reading = np.where(given["valid"] > 0.5, given["reading_mm"], past.total)
     shifted = np.concatenate([past.shifted[:, 1:], reading[:, None]], axis=1)
     layer = np.tanh(shifted @ np.sin(np.arange(12.0).reshape(4, 3)))
-    total = past.total + given["gain"] * np.maximum(layer[:, 0] - layer[:, 1] / 3.0, np.sqrt(layer[:, 2] ** 2))
+    total = past.total + given["gain"] * np.maximum(layer[:, 0] - layer[:, 1] / 3.0, np.sqrt(np.square(layer[:, 2])))
     shown = {"setpoint_mm": np.clip(total, -1e3, 1e3), "alarms": np.where(total > 1.0, 4.0, 0.0)}
     return shown, Past(total, shifted), given["time_s"] >= 0.0, (total > 0.0) & (reading < 0.0)
 
