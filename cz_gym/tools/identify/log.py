@@ -62,11 +62,14 @@ MEANT = "on", "off", "true", "false"
 """Words that stand for a number, so that they are not missing."""
 WORDS = 0.2
 """Largest share of a column's fields that may be words in place of numbers, as historians write them."""
-GOOD = "good|g|true|t|yes|y|ok|valid|gut|ja|wahr|bon|oui|vrai|vero|verdadero"
-BAD = "bad|b|false|f|no|n|not|invalid|uncertain|questionable|error|fail|schlecht|nein|falsch|mauvais|non|faux|falso"
+GOOD = "good|g|true|t|yes|y|ok|valid|normal|pass|passed|gut|ja|wahr|bon|oui|vrai|goed|vero|verdadero"
+BAD = (
+    "bad|b|false|f|no|n|not|nok|invalid|uncertain|questionable|substituted|abnormal|alarm|error|fail|failed|failure|"
+    "schlecht|nein|falsch|mauvais|non|faux|slecht|falso"
+)
 """Words of a quality; a bad one counts more, and what is uncertain is not valid."""
-TOP = 100
-"""Lines of a file among which its columns are named."""
+TOP, FOOTER = 100, 20
+"""Lines of a file among which its columns are named, and most rows around its table with words in place of a time."""
 
 
 def read_fields(path: Path, wanted: set[str], notes: dict[str, int]) -> Any:
@@ -175,6 +178,12 @@ def parse_times(column: Any, unit: str, notes: dict[str, int]) -> Any:
         )
     first, end = int(good[0]), int(good[-1]) + 1
     notes["rows above or below the table have no time"] = first + len(text) - end
+    outside = ~absent & times.isna()
+    outside.iloc[first:end] = False
+    if outside.sum() > FOOTER:
+        row, hint = outside.idxmax(), _units_meant(text[~absent], str(column.name), unit)
+        said = f"is no time in {unit}, as in {outside.sum()} rows before or after the others"
+        raise CzError(f"row {row}: {column.name} = {text[row]!r} {said}{hint}")
     inside = times.iloc[first:end]
     if inside.isna().any():
         row = inside.isna().idxmax()
@@ -247,12 +256,15 @@ MONTH = {name: n + 1 for n, name in enumerate(MONTHS)}
 MONTH |= {
     "mär": 3, "mrz": 3, "mae": 3, "mai": 5, "okt": 10, "dez": 12, "fév": 2, "fev": 2, "avr": 4, "jui": 7, "aoû": 8,
     "déc": 12, "ene": 1, "abr": 4, "ago": 8, "dic": 12, "gen": 1, "mag": 5, "giu": 6, "lug": 7, "set": 9, "ott": 10,
+    "mrt": 3, "mei": 5, "maj": 5, "des": 12, "out": 10, "sty": 1, "lut": 2, "kwi": 4, "cze": 6, "lip": 7, "sie": 8,
+    "wrz": 9, "paź": 10, "lis": 11, "gru": 12, "янв": 1, "фев": 2, "мар": 3, "апр": 4, "май": 5, "мая": 5, "июн": 6,
+    "июл": 7, "авг": 8, "сен": 9, "окт": 10, "ноя": 11, "дек": 12,
 }  # fmt: skip
-"""First letters of months in English, German, French, Spanish and Italian."""
+"""First letters of months in English, the Germanic and Romance languages, Polish and Russian."""
 ZONES = {"z": 0, "utc": 0, "gmt": 0, "wet": 0, "bst": 1, "cet": 1, "mez": 1, "cest": 2, "mesz": 2, "eet": 2, "eest": 3}
 ZONES |= {"est": -5, "edt": -4, "cst": -6, "cdt": -5, "mst": -7, "mdt": -6, "pst": -8, "pdt": -7, "jst": 9, "kst": 9}
 """Names of zones, hours from UTC."""
-_WORD, _COMPACT = r"[^\W\d_]{3,10}", r"^((?:19|20)\d{6})(\d{6}(?:[.,]\d+)?)"
+_WORD, _COMPACT = r"[^\W\d_]{3,12}", r"^((?:19|20)\d{6})[ _-]?(\d\d:?\d\d:?\d\d(?:[.,]\d+)?)"
 _DATE = {
     "ymd": r"(?P<y>\d{4})(?P<s>[-/. ]?)(?P<m>\d{1,2})(?P=s)(?P<d>\d{1,2})",
     "dMy": rf"(?P<d>\d{{1,2}})[-/. ]*(?P<m>{_WORD})[-/., ]*(?P<y>\d{{4}}|\d{{2}})",
@@ -264,9 +276,20 @@ _DATE = {
 _FORMS = {"iso": ("ymd", "dMy", "Mdy", "yMd"), "clock": ()}
 _FORMS |= {unit: (unit, *_FORMS["iso"]) for unit in ("dmy", "mdy")}
 _CLOCK = (
-    r"(?P<H>\d{1,2})[:.]?(?P<M>\d{2})(?:[:.]?(?P<S>\d{2})(?:[.,:](?P<f>\d+))?)?\s*(?P<half>[AaPp])?(?(half)\.?[Mm]\.?)"
-    r"\s*(?:Uhr|(?P<sign>[-+])(?P<zh>\d{2}):?(?P<zm>\d{2})?|(?P<zone>[A-Za-z]{1,4})(?![A-Za-z/]))?\s*(?:\[?[A-Za-z]+/[\w/+-]+\]?)?"
+    r"(?P<H>\d{1,2})(?P<p>[:.-]?)(?P<M>\d{2})(?:(?P=p)(?P<S>\d{2})(?:[.,:](?P<f>\d+))?)?"
+    r"\s*(?P<half>[AaPp])?(?(half)\.?\s?[Mm]\.?)\s*"
+    r"(?:Uhr|\(?(?:UTC|GMT)?(?P<sign>[-+])(?P<zh>\d{1,2}):?(?P<zm>\d{2})?\)?(?: \(?[A-Za-z ]+\)?)?"
+    r"|(?P<zone>[A-Za-z]{1,5})(?![A-Za-z/]))?\s*(?:\[[^\]]*\]|[A-Za-z]+/[\w/+-]+)?"
 )
+_SWAPS = {
+    _COMPACT: r"\1T\2",
+    r"^(\d{4})[年년] ?(\d{1,2})[月월] ?(\d{1,2})[日일]": r"\1-\2-\3",
+    r"(\d{1,2})[時时시] ?(\d{1,2})[分분] ?(\d{1,2})[秒초]": r"\1:\2:\3",
+    r"^(\d{1,2}:\d\d(?::\d\d)?(?:[.,]\d+)?(?: ?[AaPp][Mm])?),? (?=\d)(.*)$": r"\2 \1",  # 12:00:05 01.03.2026
+    rf"(?<=\d) de ({_WORD}) de (?=\d)": r" \1 ",
+    rf"^({_WORD}) +(\d{{1,2}}) (\d{{1,2}}:\d{{2}}:\d{{2}})((?: \w{{1,4}})?) (\d{{4}})$": r"\1 \2 \5 \3\4",
+}
+"""Other forms of times, each with the usual one; the last is C's: Sun Mar  1 12:00:05 2026."""
 
 
 def _read_times(text: Any, unit: str) -> tuple[Any, bool]:
@@ -276,41 +299,53 @@ def _read_times(text: Any, unit: str) -> tuple[Any, bool]:
     factor, _ = TIME[unit]
     if unit not in DATED:
         numbers = text.mask(text.str.fullmatch(_COMPACT)) if unit == "s" else text
-        return pandas.to_numeric(_plain_numbers(numbers), errors="coerce").astype(float) * factor, False
+        times = pandas.to_numeric(_plain_numbers(numbers), errors="coerce").astype(float) * factor
+        return times * (np.nan if unit == "s" and _is_clock(times) else 1.0), False
     if unit == "clock":
-        marked = _CLOCK.replace("[:.]?", "[:.]").replace("2", "3", 1)
+        marked = _CLOCK.replace("[:.-]?", "[:.]").replace("2", "3", 1)
         parts = text.str.extract(rf"^(?:(?P<D>\d+) days?,? +)?{marked}$")
         naive = bool(parts[["sign", "zone"]].isna().all(axis=None))
-        return _seconds(parts, 999.0) + DAY * parts["D"].astype(float).fillna(0.0), naive
-    plain = text.str.replace(_COMPACT, r"\1T\2", regex=True)
-    plain = plain.str.replace(
+        minutes = (parts["S"].isna() & (parts["H"].astype(float) > 24.0)).any()  # they are no hours
+        times = _seconds(parts, 999.0) + DAY * parts["D"].astype(float).fillna(0.0)
+        return times * (np.nan if minutes else 1.0), naive
+    plain = text.str.replace(
         rf"^[^\W\d_]{{2,10}}\.?,? +(?=\d|{_WORD})",
         lambda found: found[0] if found[0][:3].lower() in MONTH else "",
         regex=True,
     )
-    in_c = (
-        rf"^({_WORD}) +(\d{{1,2}}) (\d{{1,2}}:\d{{2}}:\d{{2}})((?: \w{{1,4}})?) (\d{{4}})$"  # Sun Mar  1 12:00:05 2026
-    )
-    plain = plain.str.replace(in_c, r"\1 \2 \5 \3\4", regex=True)
-    plain = plain.str.replace(r"^(\d{4})年(\d{1,2})月(\d{1,2})日", r"\1-\2-\3", regex=True)
+    for form, usual in _SWAPS.items():
+        plain = plain.str.replace(form, usual, regex=True)
     times, naive = pandas.Series(np.nan, text.index), True
     for form in _FORMS[unit]:
         at = times.isna()
         if not at.any():
             break
-        parts = plain[at].str.extract(rf"^{_DATE[form]}(?:[Tt ,:]+{_CLOCK})?$")
-        month = pandas.to_numeric(parts["m"], errors="coerce")
-        month = month.fillna(parts["m"].str.lower().str[:3].map(MONTH)).mask(
-            parts["m"].str.lower().isin(["juin", "juni"]), 6.0
-        )
+        parts = plain[at].str.extract(rf"^{_DATE[form]}(?:[Tt ,:_-]+{_CLOCK})?$")
+        month = pandas.to_numeric(parts["m"], errors="coerce").fillna(_months(parts["m"]))
         year, day = parts["y"].astype(float), parts["d"].astype(float)
         year = year.where(year >= 100.0, year + np.where(year < 70.0, 2000.0, 1900.0))
+        year = year.where(year.between(1800.0, 2200.0))  # pandas has no others
         dates = pandas.to_datetime(pandas.DataFrame({"year": year, "month": month, "day": day}), errors="coerce")
         days = (dates - pandas.Timestamp(0)).dt.total_seconds()
         clock = _seconds(parts).where(parts["H"].notna(), 0.0)
         times[at] = days + clock
         naive &= bool(parts[["sign", "zone"]].isna().all(axis=None))
     return times, naive
+
+
+def _is_clock(times: Any) -> bool:
+    """Tell whether numbers are digits of a clock, as 120005 is for 12:00:05: seconds since any time run up to 99."""
+    whole = times.dropna()
+    digits = [whole % 100.0, whole // 100.0 % 100.0]
+    varied = max(each.nunique() for each in digits) > 2  # those of milliseconds may be 00 and 50 alone
+    return len(whole) >= FEWEST and varied and whole.max() >= 1e4 and all(each.max() < 60.0 for each in digits)
+
+
+def _months(words: Any) -> Any:
+    """Number of the month that each word names; 1 for one that is unknown here, if the log has no other."""
+    names = words.str.lower()
+    numbers = names.str[:3].map(MONTH).mask(names.isin(["juin", "juni"]), 6.0)
+    return numbers.fillna(1.0 if names.nunique() == 1 else np.nan)
 
 
 def _seconds(parts: Any, most: float = 24.0) -> Any:
@@ -320,7 +355,7 @@ def _seconds(parts: Any, most: float = 24.0) -> Any:
     half = parts["half"].str.lower()
     wrong = (minute >= 60.0) | (second >= 61.0) | (hour > most) | (half.notna() & ((hour < 1.0) | (hour > 12.0)))
     hour = hour.where(half.isna(), hour % 12.0 + 12.0 * (half == "p"))
-    named = parts["zone"].str.lower().map(ZONES)
+    named = parts["zone"].str.lower().map(ZONES).fillna(0.0 if parts["zone"].nunique() == 1 else np.nan)
     wrong |= parts["zone"].notna() & named.isna()
     away = parts["zh"].astype(float).fillna(0.0) * HOUR + parts["zm"].astype(float).fillna(0.0) * MINUTE
     away = away * np.where(parts["sign"] == "-", -1.0, 1.0) + named.astype(float).fillna(0.0) * HOUR
@@ -362,17 +397,17 @@ def parse_quality(column: Any) -> Any:
     """Parse qualities: 1 where a reading is good, 0 where it is not; NaN where nothing is said.
 
     Words, 1 and 0, percents, codes of OPC (192 and above is good) and of OPC UA (0 is good, from 2^30 on none is), also
-    hexadecimal: 0xC0 is OPC's, 0x00000000 with its eight digits OPC UA's. CzError names a row.
+    hexadecimal: 0xC0 is OPC's, with eight digits too, 0x00000000 OPC UA's. CzError names a row.
     """
     import pandas
 
-    text = column.fillna("").str.strip()
+    text = column.fillna("").str.rstrip("% ").str.strip()
     says_good, says_bad = (text.str.contains(rf"(?i)(?<![^\W\d_])(?:{words})(?![^\W\d_])") for words in (GOOD, BAD))
     hexadecimal = text.where(text.str.fullmatch(r"0[xX][0-9a-fA-F]{1,8}"))
     numbers = pandas.to_numeric(_plain_numbers(text.mask(hexadecimal.notna())), errors="coerce").astype(float)
     numbers = numbers.fillna(hexadecimal.map(lambda code: int(code, 16), na_action="ignore").astype(float))
     codes, largest = numbers.to_numpy(), float(numbers.fillna(0.0).max())
-    if largest >= 2**30 or hexadecimal.str.len().eq(10).any():
+    if largest >= 2**30 or (hexadecimal.str.len().eq(10).any() and not 0 < largest < 256):
         good = codes < 2**30
     elif largest in (1.0, 100.0) or largest < 1.0:
         good = codes >= max(largest, 1.0) / 2.0

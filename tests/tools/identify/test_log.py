@@ -6,7 +6,7 @@ import pytest
 
 from cz_gym.puller.file import DEFAULT
 from cz_gym.support.errors import CzError
-from cz_gym.tools.identify.log import check_puller, column_map, read_log
+from cz_gym.tools.identify.log import check_puller, column_map, parse_times, read_log
 from tests.foreign_puller import ForeignPuller, Operator, drive, write_log
 
 
@@ -270,11 +270,70 @@ def test_every_kind_of_table_is_the_same_log(kind, logs, rows, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("form", "words"),
+    [("%d-%b-%y %H:%M:%S", {"Mar": "mrt", "Apr": "apr"}), ("%d de %B de %Y %T", {"March": "março", "April": "abril"}),
+     ("%d %b %Y %H:%M:%S", {"Mar": "мар", "Apr": "апр"}), ("%Y-%m-%d %H:%M:%S UTC+01:00", {}), ("%F %T (GMT-3)", {}),
+     ("%Y-%m-%d %H:%M:%S AEDT", {}), ("%Y-%m-%dT%H:%M:%SZ[UTC]", {}), ("%Y%m%d %H%M%S", {}), ("%Y%m%d-%T.000", {}),
+     ("%Y-%m-%d-%H.%M.%S.000000", {}), ("%Y-%m-%d_%H-%M-%S", {}), ("%H:%M:%S %Y-%m-%d", {}),
+     ("%a %b %d %Y %H:%M:%S GMT+0100 (Central European Time)", {}), ("%Y年%m月%d日 %H時%M分%S秒", {}),
+     ("%Y-%m-%d %I:%M:%S %p", {"AM": "a. m.", "PM": "p. m."})],
+)  # fmt: skip
+def test_a_time_may_be_written_in_any_way_and_crosses_a_month(form, words):
+    text = pandas.Series(pandas.date_range("2026-03-31T23:50:00", periods=300, freq="5s").strftime(form), name="when")
+    for word, other in words.items():
+        text = text.str.replace(word, other)
+    assert parse_times(text, "iso", {}).diff()[1:].eq(5.0).all()
+    with pytest.raises(CzError, match="did you mean time_s=when:iso"):
+        parse_times(text, "s", {})
+
+
+def test_words_that_no_list_has_need_a_log_of_one_month_and_zone():
+    """A log's times count from its first: an unknown name of a month or zone that never changes adds nothing."""
+    text = pandas.Series(
+        pandas.date_range("2026-03-31T23:50:00", periods=240, freq="5s").strftime("%d maaliskuu %Y %T XYZ")
+    )
+    assert parse_times(text[:120], "iso", {}).diff()[1:].eq(5.0).all()
+    for old, new in (("maalis", "huhti"), ("XYZ", "ABC")):
+        other = text.where(text.index < 120, text.str.replace(old, new))
+        with pytest.raises(CzError, match="is no time in iso"):
+            parse_times(other, "iso", {})
+
+
+@pytest.mark.parametrize("form", ["%H%M%S", "%y%m%d%H%M%S", "%Y%m%d%H%M%S", "%Y%m%d %H%M%S"])
+def test_digits_of_a_clock_are_no_seconds(form):
+    """From 12:00:55 to 12:01:00 they grow by 45."""
+    text = pandas.Series(pandas.date_range("2026-03-01T12:00:00", periods=300, freq="5s").strftime(form))
+    with pytest.raises(CzError, match="is no time in s"):
+        parse_times(text, "s", {})
+    for seconds in (
+        range(0, 1500, 5),
+        range(0, 1_500_000, 5000),
+        range(1_772_366_400, 1_772_366_400 + 15_000, 50),
+        range(10_000, 28_000, 60),
+    ):
+        assert parse_times(pandas.Series(map(str, seconds)), "s", {}).tolist() == [*map(float, seconds)]
+
+
+def test_rows_whose_month_is_unknown_are_no_footer():
+    text = pandas.Series(pandas.date_range("2026-03-31T23:50:00", periods=240, freq="5s").strftime("%d %b %Y %T"))
+    assert len(parse_times(pandas.concat([text, pandas.Series(["mean of all"])]), "iso", {})) == 240
+    with pytest.raises(CzError, match=r"row 120: .*'01 Nis 2026 00:00:00' is no time in iso, as in 120 rows"):
+        parse_times(text.str.replace("Apr", "Nis"), "iso", {})
+
+
+def test_minutes_and_seconds_are_no_hours_and_minutes():
+    text = pandas.Series([f"{k // 60:02}:{k % 60:02}" for k in range(0, 2400)])
+    with pytest.raises(CzError, match="is no time in clock"):
+        parse_times(text, "clock", {})
+
+
+@pytest.mark.parametrize(
     ("good", "bad"),
     [("1", "0"), ("1.0", "0.0"), ("TRUE", "FALSE"), ("true", "false"), ("Good", "Bad"), ("192", "0"), ("216", "24"),
      ("0", "2147483648"), ("0xC0", "0x18"), ("0x00000000", "0x80000000"), ("0x00000000", "0x40000000"), ("100", "0"),
      ("Good [Local Override]", "Uncertain"), ("OK", ""), ("G", "B"), ("0 (Good)", "1 (Bad)"), ("Q_GOOD", "Q_BAD"),
-     ("192 - Good", "0 - Not Good"), ("WAHR", "FALSCH"), ("vrai", "faux"), ("0x1B0", "0x0F")],
+     ("192 - Good", "0 - Not Good"), ("WAHR", "FALSCH"), ("vrai", "faux"), ("0x1B0", "0x0F"), ("OK", "NOK"),
+     ("0x000000C0", "0x00000008"), ("100%", "0%"), ("OPC_QUALITY_GOOD", "OPC_QUALITY_COMM_FAILURE")],
 )  # fmt: skip
 def test_qualities_of_any_historian_leave_out_the_same_readings(good, bad, rows, tmp_path):
     log = read_log(write(tmp_path / "log.csv", graded(good, bad)(rows)))
