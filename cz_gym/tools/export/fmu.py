@@ -4,8 +4,12 @@ A step is one control interval or several. The unit begins and ends as :class:`c
 has ended, its outputs stay.
 """
 
+import atexit
+import ctypes
 import hashlib
+import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -48,6 +52,18 @@ UNITS: dict[str, tuple[str, dict[str, Any]]] = {
 """Units by the endings of variables: the name, and exponents and factor of the SI unit."""
 
 
+def end_before_python(resources: str) -> None:
+    """End pythonfmu's state before the Python that runs a unit, whose folder of resources is given.
+
+    The C library would free this state twice: first its variable, then, in its own last function, what it pointed to.
+    Where a program of another language runs the unit, pythonfmu itself ends Python, and nothing is done here.
+    """
+    library = Path(resources).with_name("binaries") / "linux64" / f"{CzPuller.__name__}.so"
+    if sys.platform == "linux" and sys.orig_argv:
+        with suppress(OSError):  # it is loaded under another name
+            atexit.register(ctypes.CDLL(str(library), os.RTLD_NOLOAD).finalizePythonInterpreter)
+
+
 class CzPuller(Fmi2Slave):  # type: ignore[misc]
     """A puller with one crystal."""
 
@@ -55,6 +71,8 @@ class CzPuller(Fmi2Slave):  # type: ignore[misc]
 
     def __init__(self, **given: Any) -> None:
         super().__init__(**given)
+        if self.resources:  # none while the unit is built
+            end_before_python(self.resources)
         self.description = "Czochralski puller of cz-gym: one crystal, and what the puller's sensors show"
         beside = "puller file beside this module, name of a shipped one, or empty for the default"
         for kind, name, about in ((Integer, "seed", "which crystal"), (String, "scenario", "its disturbances"),

@@ -1,5 +1,6 @@
 """The puller as a co-simulation unit, run by FMPy: the same crystal as in the environment, bit for bit."""
 
+import atexit
 import subprocess
 import sys
 
@@ -92,6 +93,21 @@ def test_a_folder_with_a_space_holds_a_unit(unit, tmp_path):
     """FMPy #230: pythonfmu reads spaces in paths; what it does not read is on the page."""
     folder = fmpy.extract(unit, str(tmp_path / "a unit"))
     assert len(fmpy.simulate_fmu(folder, stop_time=10.0)) == 3
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the last function of the C library on Linux")
+def test_a_unit_ends_before_its_python(unit, monkeypatch):
+    """PythonFMU #228: its library frees its state twice at the end of a process, which aborts then now and again."""
+    ended, register = list[str](), atexit.register
+
+    def note(function, *given):
+        ended.append(function.__name__)
+        register(function, *given)
+
+    monkeypatch.setattr(atexit, "register", note)
+    for count in (1, 2):  # the second is another copy of the library
+        assert len(fmpy.simulate_fmu(unit, stop_time=10.0)) == 3
+        assert ended.count("finalizePythonInterpreter") == count
 
 
 def test_units_of_one_process_are_each_its_own(tmp_path):
