@@ -2,7 +2,7 @@
 
 import argparse
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -124,12 +124,17 @@ def benchmark(arguments: argparse.Namespace, command: str) -> int:
     if not arguments.quiet:
         print(terminal(found))
         slow = {each.name for each in task.controllers() if each.slow} - {each.name for each in contenders}
-        if arguments.controllers == ["all"] and slow:
-            names = ", ".join(sorted(slow))
-            print(f"left out of all: {names}, which are slow and not cached for every episode; add --slow to run them")
-        wrote = ", ".join(relative_path(path) for path in (arguments.out, arguments.json) if path)
-        print(f"wrote {wrote}" + (f"; open {relative_path(arguments.out / 'report.html')}" if arguments.out else ""))
+        print_ending(arguments, slow)
     return 0
+
+
+def print_ending(arguments: argparse.Namespace, left_out: set[str]) -> None:
+    """Print the slow controllers that ``all`` left out, and where the results are."""
+    if arguments.controllers == ["all"] and left_out:
+        names = ", ".join(sorted(left_out))
+        print(f"left out of all: {names}, which are slow and not cached for every episode; add --slow to run them")
+    wrote = ", ".join(relative_path(path) for path in (arguments.out, arguments.json) if path)
+    print(f"wrote {wrote}" + (f"; open {relative_path(arguments.out / 'report.html')}" if arguments.out else ""))
 
 
 def cases_of(arguments: argparse.Namespace) -> list[Case]:
@@ -163,15 +168,25 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
         if name not in known:
             raise CzError(unknown_name_message("controller", name, known, ", or all"))
     chosen = [each for each in controllers if each.name in wanted]
-    for each in chosen:
-        if not may_run(each, arguments, cases):
-            raise CzError(f"{each.name!r} is slow: add --slow to run it on the first {SLOW_EPISODES} episodes")
-    files = {name: shipped_seeds(name) for name in shipped if name in wanted and name not in given}
-    chosen += [*given.values(), *(agent(name, [*map(load_agent, some)]) for name, some in files.items())]
+    check_quick(chosen, arguments, cases)
+    chosen += agents_of(given, shipped, wanted)
     check_agents([*chosen, *own], cases)
     if not (chosen or own):
         raise CzError("no controller takes part: name some with --controllers")
     return [*chosen, *own]
+
+
+def agents_of(given: Mapping[str, Contender], shipped: Sequence[str], wanted: Sequence[str]) -> list[Contender]:
+    """Return the agents of the user's files, then the shipped ones that are wanted and that no file replaces."""
+    files = {name: shipped_seeds(name) for name in shipped if name in wanted and name not in given}
+    return [*given.values(), *(agent(name, [*map(load_agent, some)]) for name, some in files.items())]
+
+
+def check_quick(chosen: Sequence[Contender], arguments: argparse.Namespace, cases: Sequence[Case]) -> None:
+    """Raise CzError for a slow controller that may not run."""
+    for each in chosen:
+        if not may_run(each, arguments, cases):
+            raise CzError(f"{each.name!r} is slow: add --slow to run it on the first {SLOW_EPISODES} episodes")
 
 
 def may_run(contender: Contender, arguments: argparse.Namespace, cases: Sequence[Case]) -> bool:

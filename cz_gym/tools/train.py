@@ -18,7 +18,7 @@ from cz_gym.agents.recipes import (
     PPOResidual,
     TrainingConfig,
 )
-from cz_gym.agents.residual import Residual
+from cz_gym.agents.residual import Base, Residual
 from cz_gym.agents.train import read_settings
 from cz_gym.config import check_config
 from cz_gym.crystal.process import ENVIRONMENTS
@@ -110,10 +110,7 @@ def train(arguments: argparse.Namespace) -> int:
     where = f"{recipe.environment} ({', '.join(recipe.stages)}), " if recipe.environment else ""
     crystals = {ALL.name: "all"}.get(recipe.config.scenario.name, recipe.config.scenario.name)
     print(f"{recipe.name}, {amount} on {where}{crystals}{machine}, into {arguments.out}", flush=True)
-    base = None
-    if isinstance(recipe, PPOResidual):
-        base = make_base(recipe.controller, recipe.config)
-        Residual(base, *recipe.limits)  # wrong limits are refused before the work
+    base = _base_of(recipe)  # before the work
     options = _measure_references(recipe), arguments.checkpoint_seconds, arguments.plot, callbacks, base
     runs = [TrainingRun(folder, recipe, seed, *options) for folder, seed in zip(folders, seeds, strict=True)]
     if not arguments.seeds:
@@ -127,6 +124,15 @@ def train(arguments: argparse.Namespace) -> int:
             bar.write(f"seed {run.seed}: {_summary_line(summary)}")
     print(f"wrote agent.onnx into {len(runs)} folders of {arguments.out}")
     return 0
+
+
+def _base_of(recipe: TrainingConfig) -> Base | None:
+    """The controller that a recipe's agents add to; CzError for a wrong one, and for wrong limits."""
+    if not isinstance(recipe, PPOResidual):
+        return None
+    base = make_base(recipe.controller, recipe.config)
+    Residual(base, *recipe.limits)
+    return base
 
 
 def _measure_references(recipe: TrainingConfig) -> Any:
@@ -149,12 +155,17 @@ def _summary_line(summary: dict[str, float]) -> str:
     )
 
 
+def _saved_settings(resume: bool, folders: list[Path]) -> dict[str, Any]:
+    """Settings of the first run to resume, empty for a new one; CzError if that is the other way round."""
+    begun = [folder for folder in folders if (folder / "settings.json").exists()]
+    if begun and not resume:
+        raise CzError(f"{begun[0]} holds a run already. Use --resume to go on with it, or --out runs/NAME")
+    return read_settings((begun or folders)[0] / "settings.json") if resume else {}
+
+
 def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tuple[TrainingConfig, int]:
     """Recipe and training seed of the command line, or of the first resumed run; CzError if none may resume."""
-    begun = [folder for folder in folders if (folder / "settings.json").exists()]
-    if begun and not arguments.resume:
-        raise CzError(f"{begun[0]} holds a run already. Use --resume to go on with it, or --out runs/NAME")
-    saved = read_settings((begun or folders)[0] / "settings.json") if arguments.resume else {}
+    saved = _saved_settings(arguments.resume, folders)
     settings, agents = saved.get("settings", {}), saved.get("algorithm", DEFAULT_RECIPE)
     recipes = CRYSTAL_RECIPES if (arguments.env or settings.get("environment")) == CRYSTAL_ENV else RECIPES
     name = arguments.algo or {recipe.name: key for key, recipe in recipes.items()}.get(agents, agents)
@@ -162,8 +173,7 @@ def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tupl
         raise CzError(f"{name!r} is no recipe here: name one of {', '.join(recipes)} by --algo")
     own = recipes[name]
     fields = {each.name for each in dataclass_fields(own)} - {"name", "steps"}
-    chosen = {field: settings[field] for field in fields & settings.keys()}
-    chosen |= {field: tuple(value) for field, value in chosen.items() if isinstance(getattr(own, field), tuple)}
+    chosen = {field: _listed(settings[field], getattr(own, field)) for field in fields & settings.keys()}
     given = {"scenario": arguments.scenario, "puller": arguments.puller}
     chosen |= {field: value for field, value in given.items() if value}
     chosen |= dict(_setting(text, own) for text in arguments.set)
@@ -210,6 +220,10 @@ def _typed(text: str, usual: Any) -> Any:
     if not math.isfinite(number) or (usual > 0 and number < least):
         raise ValueError
     return number
+
+
+def _listed(value: Any, usual: Any) -> Any:
+    return tuple(value) if isinstance(usual, tuple) else value
 
 
 def _absolute(place: str) -> str:

@@ -18,6 +18,7 @@ from .block import Alarm, meanings
 from .controllers import make_block
 from .shell import Block
 from .text import fill_template, memory_of, shadow, test_vector, write_c, write_st
+from .trace import Program
 
 WRITERS: dict[str, Any] = {"c": write_c, "st": write_st}
 
@@ -58,13 +59,20 @@ def _export(given: argparse.Namespace) -> None:
     else:
         files = WRITERS[given.to](block.program, given.real == "float") | {"vector.csv": test_vector(block)}
         files["README.md"] = readme(block, list(files), given.real == "float")
-        page = given.out / "README.md"  # of another block, or puller: its test vector would be taken for this one's
-        text = page.read_text("utf-8", "replace") if page.exists() else ""
-        own = text.startswith(f"# {block.program.name}:") and "  \n".join(block.program.notes) in text
-        if text and not own:
-            raise CzError(f"{page} is of another block: name another folder")
+        _check_own(given.out, block.program)
     write_files({given.out / name: text.encode() if isinstance(text, str) else text for name, text in files.items()})
     print(*(relative_path(given.out / name) for name in files), sep="\n")
+
+
+def _check_own(folder: Path, program: Program) -> None:
+    """Raise CzError for a folder with the README of another block, or of the same on another puller: its test vector
+    would be taken for this one's.
+    """
+    path = folder / "README.md"
+    text = path.read_text("utf-8", "replace") if path.exists() else ""
+    own = text.startswith(f"# {program.name}:") and "  \n".join(program.notes) in text
+    if text and not own:
+        raise CzError(f"{path} is of another block: name another folder")
 
 
 def readme(block: Block, files: list[str], single: bool) -> str:

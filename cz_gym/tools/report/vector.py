@@ -168,8 +168,11 @@ def result(benchmark: Benchmark) -> str:
     top = bottom + 84.0 + 28.0 * hollow
     parts += _key(bottom + 52.0, f"hollow: told {told}" if hollow else "", any(each.learned for each in shown))
     parts += [text(12.0, top + 26.0 * row, note, class_="faint") for row, note in enumerate(notes)]
-    spoken = (f"{name} {found.mean:.3f} mm on {case}" for (case, name), found in known.items() if found)
-    return svg(top - 10.0 + 26.0 * len(notes), parts, f"Radius error of each controller: {', '.join(spoken)}")
+    return svg(top - 10.0 + 26.0 * len(notes), parts, "Radius error of each controller: " + _spoken(known))
+
+
+def _spoken(known: dict[tuple[str, str], Estimate | None]) -> str:
+    return ", ".join(f"{name} {found.mean:.3f} mm on {case}" for (case, name), found in known.items() if found)
 
 
 def _scale(axis: Axis, top: float, bottom: float) -> list[str]:
