@@ -6,7 +6,6 @@ import math
 import os
 import stat
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Self
@@ -151,24 +150,27 @@ def agent_files(path: Path, onnx_bytes: bytes, contract: Contract) -> dict[Path,
 def write_agent(path: Path, onnx_bytes: bytes | Path, **facts: Any) -> Contract:
     """Write an agent file with its contract; ``facts`` as for :func:`make_contract`.
 
-    The ONNX model, or its file, may be any exporter's (:mod:`cz_gym.agents.exported`); a graph that agents may not have
-    is told where it is loaded.
+    The ONNX model, or its file, may be any exporter's (:mod:`cz_gym.agents.exported`); AgentFileError for a graph that
+    agents may not have.
     """
-    content = plain_graph(onnx_bytes, facts["channels"])
+    content = plain_graph(onnx_bytes, facts["channels"], path)
     contract = make_contract(content, **facts)
     write_files(agent_files(path, content, contract))
     return contract
 
 
-def plain_graph(source: bytes | Path, channels: int) -> bytes:
-    """An ONNX model, or its file, as an agent's graph; as it is where it is one, or cannot become one."""
+def plain_graph(source: bytes | Path, channels: int, path: str | Path) -> bytes:
+    """An ONNX model, or its file, as the graph of the agent ``path``; AgentFileError where it cannot become one."""
     content = source.read_bytes() if isinstance(source, Path) else source
     try:
         check_graph(content, channels)
+        return content
     except GraphError:
-        with suppress(GraphError):
-            return to_plain(source, channels)
-    return content
+        pass
+    try:
+        return to_plain(source, channels)
+    except GraphError as error:
+        raise AgentFileError(f"{path}: {error}") from None
 
 
 def read_agent(path: Path) -> tuple[Contract, bytes]:

@@ -2,8 +2,9 @@
 
 Exporters write constants as nodes, weights into another file, recurrent layers with an axis of time, and shape
 arithmetic between them. Here constants are computed, axes of length 1 are left out, and GRU, LSTM and RNN become the
-operations of one step, so that what is left are operations on rows (n, width). :func:`.graph.check_graph` checks the
-result like every agent's graph; it alone reads files that others wrote.
+operations of one step, so that what is left are operations on rows (n, width). A value of several rows a puller, as
+the state (layers, n, width) of a recurrent network of several layers, becomes one row of all its numbers, in order.
+:func:`.graph.check_graph` checks the result like every agent's graph; it alone reads files that others wrote.
 """
 
 from operator import add, floordiv, mul, sub
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .graph import INPUTS, OUTPUTS, GraphError
+from .graph import INPUTS, OUTPUTS, GraphError, check_graph
 
 OPSET, IR_VERSION = 17, 9
 """Versions of the graphs that are written."""
@@ -21,6 +22,8 @@ ALIASES = ("Identity", "Cast", "Dropout", "Unsqueeze", "Squeeze", "Flatten", "Re
 GATES = {"RNN": 1, "GRU": 3, "LSTM": 4}
 """Recurrent operators, and how many vectors of the state's length their weights give."""
 
+ELEMENTWISE = {"Abs", "Add", "Div", "Elu", "Mul", "Neg", "Relu", "Sigmoid", "Softplus", "Sqrt", "Sub", "Tanh"}
+"""Operators that may act on several rows a puller."""
 ARITHMETIC: dict[str, Any] = {"Mul": mul, "Add": add, "Sub": sub, "Div": floordiv}
 """Operators that may compute a length."""
 
@@ -32,7 +35,7 @@ def to_plain(source: bytes | Path, channels: int) -> bytes:
     """
     import onnx
     from google.protobuf.message import Error as ProtobufError
-    from onnx import inliner
+    from onnx import inliner, version_converter
 
     try:
         model = onnx.load(source) if isinstance(source, Path) else onnx.load_from_string(source)
@@ -40,9 +43,15 @@ def to_plain(source: bytes | Path, channels: int) -> bytes:
             raise GraphError("keeps weights in another file: give the path of the ONNX file, beside which it lies")
         if len(model.functions):
             model = inliner.inline_local_functions(model)
+        if (
+            any(node.op_type == "BatchNormalization" for node in model.graph.node)
+            and model.opset_import[0].version < 14
+        ):
+            model = version_converter.convert_version(model, OPSET)  # onnx would compute an older one as in training
         before = model.SerializeToString()
-        plain = _Rebuilt(model, channels).serialised()
-        _compare(onnx.load_from_string(before), onnx.load_from_string(plain))
+        plain = (rebuilt := _Rebuilt(model, channels)).serialised()
+        check_graph(plain, channels)
+        _compare(onnx.load_from_string(before), onnx.load_from_string(plain), rebuilt.places)
         return plain
     except GraphError:
         raise
@@ -74,12 +83,19 @@ class _Rebuilt:
         self.state = self._begin(channels)
         for node in model.graph.node:
             self._rows_of(node, {each.name: helper.get_attribute_value(each) for each in node.attribute})
-        self._end([value.name for value in model.graph.output])
+        self._end(results := [value.name for value in model.graph.output])
+        self.places = [[self._shape(name).index("n") for name in names] for names in (self.names, results)]
+        """Axes of the pullers in inputs and outputs."""
 
     def serialised(self) -> bytes:
-        """The new model."""
+        """The new model, without what its outputs do not need."""
         from onnx import TensorProto, checker, helper, numpy_helper
 
+        nodes, needed = list[Any](), set(OUTPUTS)
+        for node in reversed(self.nodes):
+            if needed & set(node.output):
+                nodes.insert(0, node)
+                needed |= set(node.input)
         widths = ([self.channels, *self.width], [2, *self.width])
         values = [
             [
@@ -88,8 +104,8 @@ class _Rebuilt:
             ]
             for names, own in zip((INPUTS, OUTPUTS), widths, strict=True)
         ]
-        tensors = [numpy_helper.from_array(array, name) for name, array in self.tensors.items()]
-        graph = helper.make_graph(self.nodes, "cz_gym_agent", values[0], values[1], tensors)
+        tensors = [numpy_helper.from_array(array, name) for name, array in self.tensors.items() if name in needed]
+        graph = helper.make_graph(nodes, "cz_gym_agent", values[0], values[1], tensors)
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
         checker.check_model(model)
         content: bytes = model.SerializeToString()
@@ -99,8 +115,8 @@ class _Rebuilt:
         """Name the inputs; returns the lengths of the parts of the state."""
         if not self.inputs:
             raise GraphError("has no input")
-        first, *others = (value.name for value in self.inputs)
-        lengths = [self._length(name) for name in (first, *others)]
+        self.names = first, *others = [value.name for value in self.inputs]
+        lengths = [self._length(first), *map(self._size, others)]
         if lengths[0] != channels:
             raise GraphError(f"reads {lengths[0]} channels, not {channels}")
         self.channels, self.width, self.rows[first] = channels, [sum(lengths[1:])] if others else [], INPUTS[0]
@@ -116,7 +132,7 @@ class _Rebuilt:
         for name in names:
             if name not in self.rows:
                 raise GraphError("its outputs do not depend on its inputs")
-        lengths = [self._length(name) for name in names]
+        lengths = [self._size(name) for name in names]
         if lengths != [2, *self.state]:
             expected = "2 numbers, the action" + "".join(f", then {k} of the next state" for k in self.state)
             raise GraphError(f"gives {' and '.join(map(str, lengths))} numbers in {len(names)} outputs, not {expected}")
@@ -138,6 +154,8 @@ class _Rebuilt:
     def _tensor(self, array: Any) -> str:
         array = np.asarray(array)
         kept = array.astype(np.int64 if array.dtype.kind in "iub" else np.float32)
+        if not np.isfinite(kept).all():
+            raise GraphError("has weights that are not finite")
         name = f"w{len(self.tensors)}"
         self.tensors[name] = kept
         return name
@@ -158,13 +176,30 @@ class _Rebuilt:
             raise GraphError(f"has a value of shape {self._shape(name)}, not one row a puller{fixed}")
         return int(others[0]) if others else 1
 
-    def _axis(self, name: str, axis: int) -> str:
-        """Tell of an axis whether it is the one of the pullers, the row's ("width"), or one of length 1."""
+    def _size(self, name: str) -> int:
+        """Count of a value's numbers for each puller."""
+        return int(self._numbers(name).size)
+
+    def _numbers(self, name: str) -> Any:
+        """Number the columns of a value's row, in the value's own shape with a length of 1 for the pullers."""
         shape = self._shape(name)
-        axis %= len(shape)
+        if shape.count("n") != 1 or any(not isinstance(dim, int) for dim in shape if dim != "n"):
+            self._length(name)
+        lengths = [1 if dim == "n" else dim for dim in shape]
+        return np.arange(np.prod(lengths, dtype=int)).reshape(lengths)
+
+    def _pick(self, rows: str, columns: Any) -> str:
+        """Select columns of rows, by their numbers in any shape."""
+        flat, (low, high) = columns.ravel(), (int(columns.min()), int(columns.max()) + 1)
+        if np.array_equal(flat, np.arange(low, high)):
+            return self._columns(rows, low, high)
+        return self._emit("Gather", [rows, flat], axis=1)
+
+    def _is_row_axis(self, name: str, axis: int) -> bool:
+        """Tell whether an axis is the one of a value's row: the only one that is longer than 1, or the last one."""
+        shape = self._shape(name)
         others = [place for place, dim in enumerate(shape) if dim != "n"]
-        own = next((place for place in others if shape[place] != 1), others[-1] if others else -1)
-        return "pullers" if shape[axis] == "n" else "width" if axis == own else "one"
+        return axis % len(shape) == next((place for place in others if shape[place] != 1), others[-1] if others else -1)
 
     def _fold(self, graph: Any) -> bool:
         """Compute the nodes of constants and known lengths, and remove them; True if there was one."""
@@ -173,9 +208,11 @@ class _Rebuilt:
         known = set(self.constants)
         left = [node for node in graph.node if not self._known(node)]
         for node in left:
-            lengths = self.dims.get(node.input[1], ()) if node.op_type == "Reshape" else ()
+            any_rows = {"Reshape": -1, "Expand": 1}.get(node.op_type)
+            lengths = self.dims.get(node.input[1], ()) if any_rows else ()
             if list(lengths).count("n") == 1:
-                self.constants[name := f"{node.input[1]} open"] = np.array([-1 if k == "n" else k for k in lengths])
+                name = f"{node.input[1]} of {node.op_type}"
+                self.constants[name] = np.array([any_rows if k == "n" else k for k in lengths])
                 node.input[1] = name
         folded = len(left) < len(graph.node)
         del graph.node[:]
@@ -191,8 +228,8 @@ class _Rebuilt:
 
         attributes = {each.name: helper.get_attribute_value(each) for each in node.attribute}
         given = [name for name in node.input if name]
-        if node.op_type == "Shape" and given[0] in self.shapes and given[0] not in self.constants:
-            dims = self.shapes[given[0]]
+        dims = self.shapes.get(given[0], ()) if given and given[0] not in self.constants else ()
+        if node.op_type == "Shape" and dims and list(dims).count("n") <= 1:  # more: lengths that are not known yet
             self.dims[node.output[0]] = dims[attributes.get("start", 0) : attributes.get("end", len(dims))]
             self._settle(node.output[0])
         elif all(name in self.constants for name in given):
@@ -208,12 +245,18 @@ class _Rebuilt:
             self.constants[name] = np.array(self.dims.pop(name), np.int64)
 
     def _count(self, node: Any) -> None:
-        """Shape arithmetic: what picks and joins known lengths."""
+        """Shape arithmetic: what picks and joins known lengths; a constant row for each puller is one for all."""
+        from onnx import numpy_helper
+
         parts = [
             self.dims[name] if name in self.dims else np.atleast_1d(self.constants[name]).tolist()
             for name in node.input
             if name
         ]
+        if node.op_type == "ConstantOfShape":
+            value = next((numpy_helper.to_array(each.t)[0] for each in node.attribute), np.float32(0.0))
+            self.constants[node.output[0]] = np.full([1 if dim == "n" else dim for dim in parts[0]], value)
+            return
         if node.op_type == "Gather":
             found = [parts[0][int(i)] for i in parts[1]]
             if np.ndim(self.constants[node.input[1]]) == 0 and found[0] != "n":
@@ -225,10 +268,12 @@ class _Rebuilt:
         self._settle(node.output[0])
 
     def _compute(self, node: Any) -> None:
-        """Compute a node of constants."""
+        """Compute a node of constants; GraphError for one that draws random numbers."""
         from onnx import TensorProto, helper
         from onnx.reference import ReferenceEvaluator
 
+        if node.op_type.startswith(("Random", "Bernoulli", "Multinomial")):
+            raise GraphError(f"draws random numbers, in {node.op_type}")
         given = {name: self.constants[name] for name in node.input if name}
         types = [helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(np.asarray(value).dtype), None)
                  for name, value in given.items()]  # fmt: skip
@@ -253,57 +298,86 @@ class _Rebuilt:
         if operator in GATES:
             self._step(node, attributes)
             return
-        for name in filter(None, node.output[:1] if operator == "Dropout" else node.output):
-            self._length(name)
+        results = [name for name in (node.output[:1] if operator == "Dropout" else node.output) if name]
         if operator in ALIASES:
-            if self._length(first) != self._length(node.output[0]):
-                raise GraphError(f"its {operator} changes the length of a row")
-            self.rows[node.output[0]] = self.rows[first]
+            self._check_order(node, attributes)
+            self.rows[results[0]] = self.rows[first]
         elif operator in ("Gather", "Slice", "Split", "Concat"):
             self._parts(node, attributes)
-        elif operator in _OTHERS:
+        elif operator not in ELEMENTWISE or not self._alike(node):
+            for name in (*(name for name in node.input if name in self.rows), *results):
+                self._length(name)
+        if results[0] in self.rows:
+            return
+        if operator in _OTHERS:
             x = self.rows[first]
             values = [self._operand(name) for name in node.input[1:]]
-            self.rows[node.output[0]] = _OTHERS[operator](self, x, values, attributes, self._length(first))
+            self.rows[results[0]] = _OTHERS[operator](self, x, values, attributes, self._length(first))
+            return
+        if "axis" in attributes and self._is_row_axis(first, attributes["axis"]):
+            attributes["axis"] = -1
+        operands = [self._operand(name) for name in node.input]
+        self.rows[results[0]] = self._emit(operator, operands, **attributes)
+
+    def _alike(self, node: Any) -> bool:
+        """Tell whether the operands of a node are of one shape, but for single numbers."""
+        shapes = [self._shape(name) for name in (*node.input, *node.output) if name in self.rows or name in node.output]
+        others = [self.constants[name] for name in node.input if name in self.constants]
+        return all(shape == shapes[0] for shape in shapes) and all(np.size(each) == 1 for each in others)
+
+    def _check_order(self, node: Any, attributes: dict[str, Any]) -> None:
+        """GraphError for a node that gives a row another length, or its numbers another order."""
+        before, after = (self._shape(name) for name in (node.input[0], node.output[0]))
+        self._numbers(node.output[0])
+        if self._size(node.input[0]) != self._size(node.output[0]):
+            raise GraphError(f"its {node.op_type} changes the length of a row")
+        if node.op_type == "Transpose":
+            order = attributes.get("perm", [*range(len(before))[::-1]])
+            moved = [place for place in order if before[place] not in (1, "n")]
+            mixed = moved != sorted(moved)
         else:
-            if "axis" in attributes:
-                attributes["axis"] = -1 if self._axis(first, attributes["axis"]) == "width" else attributes["axis"]
-            operands = [self._operand(name) for name in node.input]
-            self.rows[node.output[0]] = self._emit(operator, operands, **attributes)
+            sizes = [np.prod(shape[: shape.index("n")], dtype=int) for shape in (before, after)]
+            mixed = node.op_type in ("Reshape", "Flatten") and sizes[0] != sizes[1]
+        if mixed:
+            raise GraphError(f"its {node.op_type} changes the order of numbers, from {before} to {after}")
 
     def _parts(self, node: Any, attributes: dict[str, Any]) -> None:
-        """Rebuild a node that picks, cuts or joins columns."""
+        """Rebuild a node that picks, cuts or joins columns, by what it does to their numbers."""
         operator, first, result = node.op_type, node.input[0], node.output[0]
         values: list[Any] = [self.constants.get(name) for name in node.input[1:]]
-        if operator == "Slice":
-            self.rows[result] = self._slice(first, *values)
-            return
         axis = attributes.get("axis", 0)
-        kind = self._axis(result if operator == "Concat" else first, axis)
-        if operator == "Gather" and kind == "one":
-            self.rows[result] = self.rows[first]
-        elif kind != "width":
+        if operator != "Slice" and self._shape(result if operator == "Concat" else first)[axis] == "n":
             raise GraphError(f"its {operator} works on another axis than that of the channels")
-        elif operator == "Gather":
-            self.rows[result] = self._emit("Gather", [self.rows[first], np.atleast_1d(values[0])], axis=1)
-        elif operator == "Concat":
-            self.rows[result] = self._emit("Concat", [self._operand(name) for name in node.input], axis=1)
+        if operator == "Concat":
+            ends = np.cumsum([0, *(self._size(name) for name in node.input)])
+            numbers = [self._numbers(name) + end for name, end in zip(node.input, ends, strict=False)]
+            joined = self._emit("Concat", [self._operand(name) for name in node.input], axis=1)
+            self.rows[result] = self._pick(joined, np.concatenate(numbers, axis))
+            return
+        if operator == "Split":
+            ends = np.cumsum([self._shape(name)[axis] for name in node.output])[:-1]
+            parts = np.split(self._numbers(first), ends, axis)
         else:
-            ends = np.cumsum([0, *(self._length(name) for name in node.output)]).tolist()
-            for name, low, high in zip(node.output, ends, ends[1:], strict=False):
-                self.rows[name] = self._columns(self.rows[first], low, high)
+            parts = [
+                self._slice(first, *values)
+                if operator == "Slice"
+                else np.take(self._numbers(first), np.asarray(values[0], int), axis)
+            ]
+        for name, part in zip(node.output, parts, strict=True):
+            if not part.size:
+                raise GraphError(f"its {operator} leaves nothing")
+            self.rows[name] = self._pick(self.rows[first], part)
 
-    def _slice(self, name: str, lows: Any, highs: Any, axes: Any = None, steps: Any = None) -> str:
-        """Cut columns from a value's rows, along any axes; GraphError where pullers would be left out."""
-        rows = self.rows[name]
+    def _slice(self, name: str, lows: Any, highs: Any, axes: Any = None, steps: Any = None) -> Any:
+        """Cut the numbers of a value's columns along any axes; GraphError where pullers would be left out."""
+        numbers = self._numbers(name)
         for place, axis in enumerate(np.asarray(range(len(lows)) if axes is None else axes).tolist()):
             low, high, step = int(lows[place]), int(highs[place]), 1 if steps is None else int(steps[place])
-            kind = self._axis(name, axis)
-            if kind == "width":
-                rows = self._emit("Slice", [rows, *(np.array([each]) for each in (low, high, 1, step))])
-            elif (low, step) != (0, 1) or high < (1 if kind == "one" else 2**31 - 1):
+            if self._shape(name)[axis] != "n":
+                numbers = numbers[(slice(None),) * (axis % numbers.ndim) + (slice(low, high, step),)]
+            elif (low, step) != (0, 1) or high < 2**31 - 1:
                 raise GraphError("cuts another axis than that of the channels")
-        return rows
+        return numbers
 
     def _step(self, node: Any, attributes: dict[str, Any]) -> None:
         """One step of a recurrent layer in plain operations; ONNX's gates are in the orders z r h, and i o f c."""
@@ -376,6 +450,9 @@ def _lengths(operator: str, parts: list[list[Any]]) -> list[Any]:
         return parts[0]
     if operator == "Slice":
         return parts[0][int(parts[1][0]) : int(parts[2][0])]
+    if operator in ("Equal", "Where"):
+        columns = zip(*(part * max(map(len, parts)) if len(part) == 1 else part for part in parts), strict=True)
+        return [column[0] == column[1] if operator == "Equal" else column[1 if column[0] else 2] for column in columns]
     if operator not in ARITHMETIC or any(len(part) != 1 for part in parts):
         raise GraphError(f"computes with the number of pullers, in {operator}")
     (a,), (b,) = parts
@@ -403,17 +480,20 @@ def _joined(parts: list[Any]) -> list[Any]:
     return [parts[0], *([np.concatenate(parts[1:], axis=1)] if parts[1:] else [])]
 
 
-def _compare(before: Any, after: Any) -> None:
-    """GraphError unless both models give the same actions and states for some observations."""
+def _compare(before: Any, after: Any, places: list[list[int]]) -> None:
+    """GraphError unless both models give the same actions and states for some observations; ``places`` are the axes of
+    pullers in inputs and outputs.
+    """
     from onnx.reference import ReferenceEvaluator
 
+    def by_puller(values: Any, axes: list[int]) -> list[Any]:
+        moved = [np.moveaxis(np.asarray(each), axis, 0) for each, axis in zip(values, axes, strict=True)]
+        return _joined([each.reshape(len(each), -1).astype(np.float32) for each in moved])
+
     inputs = _some_inputs(before.graph)
-    rows = [*inputs.values()]
-    wanted = ReferenceEvaluator(before).run(None, inputs)
-    n = rows[0].size // after.graph.input[0].type.tensor_type.shape.dim[1].dim_value
-    flat = [each.reshape(n, -1).astype(np.float32) for each in rows]
-    found = ReferenceEvaluator(after).run(None, dict(zip(INPUTS, _joined(flat), strict=False)))
-    for one, other in zip(_joined([np.reshape(each, (n, -1)) for each in wanted]), found, strict=True):
+    wanted = by_puller(ReferenceEvaluator(before).run(None, inputs), places[1])
+    given = dict(zip(INPUTS, by_puller(inputs.values(), places[0]), strict=False))
+    for one, other in zip(wanted, ReferenceEvaluator(after).run(None, given), strict=True):
         if one.shape != other.shape or not np.allclose(one, other, rtol=1e-3, atol=1e-4):
             raise GraphError("would act otherwise once it is rebuilt: give a simpler network")
 

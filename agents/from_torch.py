@@ -121,7 +121,8 @@ def to_onnx(module: nn.Module, channels: int, state_size: int = 0) -> bytes:
             f"{name} gives {given} for two crystals, not {wanted}: the action, shape (n, 2)"
             + (", and the next state" if state_size else "; with a memory say its state_size")
         )
-    return plain_graph(export(Clipped(module), examples, name), channels)
+    content = export(Clipped(module), examples, name)
+    return plain_graph(content, channels, f"{name} cannot be written as an agent file")
 
 
 def export(module: nn.Module, examples: Sequence[torch.Tensor], name: str) -> bytes:

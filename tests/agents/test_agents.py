@@ -9,7 +9,7 @@ import pytest
 
 from cz_gym import agents
 from cz_gym.agents import AgentFileError, OnnxPolicy
-from cz_gym.agents.contract import MAX_BYTES, read_agent, write_agent
+from cz_gym.agents.contract import MAX_BYTES, make_contract, read_agent, write_agent
 from cz_gym.agents.from_sb3 import to_onnx
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
@@ -125,9 +125,9 @@ def infinity_less_infinity(model):
 def test_networks_that_give_no_action_are_refused(change, message, agent):
     model = onnx.load_from_string(agent.read_bytes())
     change(model)
-    write_agent(agent, model.SerializeToString(), **facts())
+    content = model.SerializeToString()
     with pytest.raises(AgentFileError, match=message):
-        OnnxPolicy.load(agent)
+        OnnxPolicy.of(make_contract(content, **facts()), content)
 
 
 def test_an_agent_loads_where_the_system_has_no_pipes_to_wait_for(agent, monkeypatch):
