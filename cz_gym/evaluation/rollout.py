@@ -167,6 +167,9 @@ def settings_of(policy: Any) -> dict[str, Any]:
         own = getattr(policy, each, None)
         if isinstance(own, kind) and given.setdefault(each, own) != own:
             raise CzError(f"{name}: its {each} is {own!r}, its settings say {given[each]!r}")
+        if each in given and not isinstance(given[each], kind):
+            wanted = "a time [s]" if kind is Real else "a name"
+            raise CzError(f"{name}: its setting {each} must be {wanted}, not {given[each]!r:.80}")
     return given
 
 
@@ -183,7 +186,7 @@ def _check_settings(policy: Any, declared: Mapping[str, Any], target: Config) ->
     for name in INTERFACE:
         has = getattr(target, name)
         if name in declared and has != getattr(wanted, name) and not (name == "observation" and has in readable):
-            said = f"was made for {name}={declared[name]!r:.80}; the environment has {has!r:.80}"
+            said = f"was made for {name}={declared[name]!r:.80}; the environment has {getattr(has, 'label', has)!r:.80}"
             raise CzError(f"{type(policy).__name__}: this controller or agent {said}")
 
 

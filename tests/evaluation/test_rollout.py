@@ -297,6 +297,9 @@ class Typo(Base):
 class Repeats(Base):
     settings = {"observation": "history", "action_repeat": 4}
 
+class Text(Base):
+    settings = {"control_interval": "5"}
+
 class State(Base):
     settings = {"observation": "state"}
 
@@ -328,10 +331,11 @@ def test_settings_say_what_a_controller_reads_wherever_they_stand(own, name):
     ("name", "says"),
     [
         ("Slow", r"own\.py:Slow: Slow: this .* was made for .*control_interval=10.*; the environment has .*=5"),
-        ("Germanium", "was made for puller='germanium'; the environment has PullerFile"),
+        ("Germanium", "was made for puller='germanium'; the environment has 'default"),
         ("Unsure", "its observation is 'measured', its settings say 'history'"),
         ("Typo", "unknown setting 'observations': did you mean 'observation'"),
         ("Repeats", "repeats its actions"),
+        ("Text", r"its setting control_interval must be a time \[s\], not '5'"),
         ("nothing", "it makes a SimpleNamespace, which has no method predict"),
     ],
 )
