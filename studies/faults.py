@@ -2,9 +2,9 @@
 
 Every controller's block grows the same crystals without and with each fault: calls that come early, late or unevenly, a
 pyrometer that is gone for two hours or drifts, nominal values that are off, drives that stand still or are read wrong,
-a ring that steps or gets stuck. The environment runs at half of the block's interval, and the ring's time is that of
-its frame. Where drives are read wrong, the scenario's own errors of their readings are left out: each error stands
-alone, beside "drives read exactly". Agents grow under these faults.
+a ring that steps or gets stuck, an operator who left the pull off its nominal speed. The environment runs at half of
+the block's interval, and the ring's time is that of its frame. Where drives are read wrong, the scenario's own errors
+of their readings are left out: each error stands alone, beside "drives read exactly". Agents grow under these faults.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,13 +25,14 @@ from cz_gym.episodes.scenario import DriveReadings
 from cz_gym.evaluation.protocol import TEST_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.support.command_line import between
+from cz_gym.support.errors import CzError
 from cz_gym.support.files import write_files
 from cz_gym.support.units import HOUR, MINUTE, MM
 from cz_gym.tools.export.block import SETPOINT_NAMES, Alarm
 from cz_gym.tools.export.controllers import make_block
 from cz_gym.tools.export.shell import Block, BlockPolicy, Runner
 from cz_gym.tools.export.text import CompiledBlock
-from cz_gym.tools.report.tables import markdown
+from cz_gym.tools.report.tables import NOTHING, markdown
 
 from . import StudyParser
 
@@ -46,6 +48,8 @@ STEP = 0.75 * HOUR
 FULL, STEPS = (2.4, 20.0), (0.01, 0.1)
 """Full ranges of pull speed [mm/min] and heater power [kW], and largest resolutions of their readings."""
 DRIVES = tuple(SETPOINT_NAMES.values())
+TAKEN_OVER = 10.0 * MINUTE
+"""When a block takes over from an operator [s]."""
 SETTLED = 0.5 * HOUR
 """Time from which errors count [s]."""
 
@@ -99,6 +103,8 @@ class Fault(NamedTuple):
     """Time at which the ring is read right again [s]."""
     drift: float = 0.0
     """Drift of the pyrometer [K/h]."""
+    operator: float = 0.0
+    """Pull speed above nominal of an operator, who has the drives until :data:`TAKEN_OVER` [mm/min]; 0: nobody."""
 
     @property
     def of_readings(self) -> bool:
@@ -140,6 +146,8 @@ FAULTS = {
     "ring stuck for 30 min": Fault(ring=lambda true, last: last, ring_ends=STEP + 30.0 * MINUTE),
     "pyrometer drifts by -2 K/h": Fault(drift=-2.0),
     "pyrometer drifts by -4 K/h": Fault(drift=-4.0),
+    "operator left -0.1 mm/min": Fault(operator=-0.1),
+    "operator left -0.2 mm/min": Fault(operator=-0.2),
 }
 
 
@@ -150,6 +158,8 @@ class Faulty:
         self.fault, self.runner, self.dt = fault, runner, block.config.control_interval
         self.off = {name: block.ports[name].default + fault.off * most for name, most in OFF.items()}
         self.latency = max(each.sensor.latency for each in block.config.scenario.scenarios)
+        rest = (block.ports[f"nominal_{name}"].default for name in DRIVES)
+        self.operated = dict(zip(SETPOINT_NAMES, np.add(list(rest), (fault.operator, 0.0)), strict=True))
         self.time, self.calls, self.due, self.bits = 0.0, 0, 0.0, 0
         self.limited = list[float]()
         self.seen: Any = 0.0
@@ -186,7 +196,10 @@ class Faulty:
             given["ring_radius_mm"] = self.fault.ring(inputs["ring_radius_mm"], self.ring)
         else:
             self.ring = inputs["ring_radius_mm"]
-        outputs, memory = self.runner.run(given, memory)
+        operated = self.fault.operator != 0.0 and time < TAKEN_OVER
+        outputs, memory = self.runner.run(given | ({"automatic": 0.0} if operated else {}), memory)
+        if operated:
+            outputs = outputs | {name: 0.0 * outputs[name] + at for name, at in self.operated.items()}
         if time > SETTLED:
             alarms = outputs["alarms"].astype(np.int64)
             self.bits |= int(np.bitwise_or.reduce(alarms))
@@ -224,22 +237,39 @@ def grow(block: Block, fault: str, crystals: int, runner: Runner | None = None, 
     return Row(rmse, len(ends), int(helpless.sum()), Alarm(faulty.bits), limited)
 
 
-def report(rows: Mapping[tuple[str, str], Row], crystals: int) -> str:
+Cells = tuple[str, ...]
+"""The texts of a row of the report behind its controller and fault."""
+
+
+def row_of(row: Row, exact: float | None) -> Cells:
+    """The texts of a row; ``exact`` is the controller's error to compare with [mm]."""
+    lost = f"{row.lost} ({row.helpless})" if row.helpless else str(row.lost)
+    names = ", ".join(bit.name or "" for bit in row.alarms)
+    return f"{row.rmse:.3f}", f"{row.rmse / exact:.2f}" if exact else NOTHING, lost, f"{row.limited:.1%}", names
+
+
+def earlier(file: Path, about: str) -> dict[tuple[str, str], Cells]:
+    """The rows of a report, if there is one, by controller and fault; CzError if it is of other crystals."""
+    if not file.is_file():
+        return {}
+    if about not in (text := file.read_text("utf-8")):
+        raise CzError(f"{file} is not of {about}: give its --crystals, or another --out")
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
+    return {(line[0], line[1]): tuple(line[2:]) for line in lines if line[1] in FAULTS}
+
+
+def report(rows: Mapping[tuple[str, str], Cells], about: str) -> str:
     """The table, by controller and fault."""
-    lines = []
-    for (controller, fault), row in rows.items():
-        share = row.rmse / rows[controller, EXACT if FAULTS[fault].of_readings else "none"].rmse
-        lost = f"{row.lost} ({row.helpless})" if row.helpless else str(row.lost)
-        names = ", ".join(bit.name or "" for bit in row.alarms)
-        lines.append((controller, fault, f"{row.rmse:.3f}", f"{share:.2f}", lost, f"{row.limited:.1%}", names))
+    names, order = list(dict.fromkeys(name for name, _ in rows)), list(FAULTS)
+    keys = sorted(rows, key=lambda key: (names.index(key[0]), order.index(key[1])))
     heads = "controller", "fault", "RMSE [mm]", "ratio", "lost", "limited", "alarms"
     return f"""# Blocks under the faults of a plant
 
-{crystals} test crystals of three hours each, errors from half an hour on, of those that were kept. In brackets: those
+{about}, errors from half an hour on, of those that were kept. In brackets: those
 of the lost that were lost while the drives stood still, when no block acts. Limited: share of the time with a bit that
 says so. Ratio: to the error without a fault, or with drives that read exactly.
 
-{markdown(heads, lines)}
+{markdown(heads, [(*key, *rows[key]) for key in keys])}
 """
 
 
@@ -255,18 +285,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("controllers", nargs="*", help=f"names ({', '.join(CONTROLLERS)})")
     about = "test crystals (%(default)s)"
     parser.add_argument("--crystals", type=between(1, 500), default=CRYSTALS, metavar="N", help=about)
+    about = "a fault, may be given again; the other rows of a report on as many crystals stay (all, a new report)"
+    parser.add_argument("--fault", action="append", choices=FAULTS, metavar="FAULT", help=about)
     return parser.run(_main, arguments, "plant")
 
 
 def _main(given: argparse.Namespace) -> None:
-    rows: dict[tuple[str, str], Row] = {}
+    about, file = f"{given.crystals} test crystals of three hours each", given.out / "report.md"
+    rows = earlier(file, about) if given.fault else {}
+    errors = {key: float(cells[0]) for key, cells in rows.items()}
     for name in given.controllers or CONTROLLERS:
         block = make_block(name, make_config("puller", observation="measured", action="direct"))
         runner = CompiledBlock(block)
-        for fault in faults_of(name):
-            rows[name, fault] = grow(block, fault, given.crystals, runner)
-            print(name, fault, *rows[name, fault], flush=True)
-        write_files({given.out / "report.md": report(rows, given.crystals).encode()})
+        for fault in [each for each in faults_of(name) if each in (given.fault or FAULTS)]:
+            row = grow(block, fault, given.crystals, runner)
+            errors[name, fault] = row.rmse
+            exact = errors.get((name, EXACT if FAULTS[fault].of_readings else "none"))
+            rows[name, fault] = row_of(row, exact)
+            print(name, fault, *row, flush=True)
+        write_files({file: report(rows, about).encode()})
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from cz_gym.tools import leaderboard
 from cz_gym.tools.registry import agent_hash
 from cz_gym.tools.report.task_records import contract_hash
 from cz_gym.tools.run import earlier_robustness
-from studies import cards, frontier, picture, ranks, robustness, speed, stock
+from studies import cards, faults, frontier, picture, ranks, robustness, speed, stock
 from tests.conftest import ROOT
 
 FIGURES = {key: {"mean": 0.0, "ci95": [0.0, 0.5]} for key in (*(of.metric for of in cards.FIGURES), cards.RETURN)}
@@ -255,6 +255,29 @@ def test_a_report_shows_robustness_of_this_contract_and_of_these_agent_files(mon
         other.write_text(file.read_text().replace(old, "0123456789ab"))
         assert earlier_robustness(other) == left
     assert set(robustness.CONTROLLERS) >= set(earlier_robustness(ROOT / "results" / "robustness" / "robustness.csv"))
+
+
+# Faults: a row made anew
+
+
+def test_a_fault_made_anew_leaves_the_other_rows_of_the_report(monkeypatch, tmp_path, capsys):
+    grown = []
+    monkeypatch.setattr(faults, "make_block", lambda name, _: name)
+    monkeypatch.setattr(faults, "CompiledBlock", lambda block: block)
+    monkeypatch.setattr(faults, "grow", lambda name, fault, *_: grown.append((name, fault)) or made)
+    command, made = ["--crystals", "2", "--out", str(tmp_path)], faults.Row(0.25, 0, 0, faults.Alarm(1), 0.1)
+    assert faults.main(["paper-tuned", "lqg", *command]) == 0
+    before, count = (tmp_path / "report.md").read_text().splitlines(), len(grown)
+    made = faults.Row(0.5, 3, 1, faults.Alarm(0), 0.0)
+    row = "operator left -0.1 mm/min"
+    assert faults.main(["lqg", *command, "--fault", row]) == 0
+    after = (tmp_path / "report.md").read_text().splitlines()
+    assert grown[count:] == [("lqg", row)]
+    changed = [pair for pair in zip(before, after, strict=True) if pair[0] != pair[1]]
+    assert [new for _, new in changed] == [f"| lqg | {row} | 0.500 | 2.00 | 3 (1) | 0.0% |  |"]
+    assert faults.main(["lqg", "--crystals", "3", "--out", str(tmp_path), "--fault", row]) == 2
+    assert "give its --crystals" in capsys.readouterr().err
+    assert (tmp_path / "report.md").read_text().splitlines() == after
 
 
 # Ranks under moved estimates, and the limit
