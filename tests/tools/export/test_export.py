@@ -459,6 +459,29 @@ def test_a_takeover_moves_no_drive_and_authority_grows(name):
     assert Alarm.TAKEOVER not in alarms[-1]
 
 
+@pytest.mark.parametrize("runner", LANGUAGES)
+def test_a_pull_far_from_nominal_goes_back_at_once_and_leaves_nothing_behind(runner):
+    """An integral that began at the operator's pull stood in the radius for hours, and no controller came back."""
+    plant = Plant("paper-tuned", runner)
+    plant(pull_speed_mm_per_min=1.1, automatic=0.0)
+    outputs = plant(pull_speed_mm_per_min=1.1)
+    assert outputs[PULL] == 1.1
+    pulls = []
+    for _ in range(40):
+        outputs = plant(pull_speed_mm_per_min=outputs[PULL])
+        pulls.append(outputs[PULL])
+    assert Alarm.FALLBACK in Alarm(int(outputs[ALARMS]))
+    assert pulls[3:] == pytest.approx([1.2] * 37, abs=1e-3)  # four samples at the slew rate
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["lqg", "lqg-at-0.02", "paper-tuned"])
+def test_a_takeover_after_an_operator_s_slow_pull_loses_no_crystal(name):
+    row = grow(block_of(name), "operator left -0.1 mm/min", 10, CompiledBlock(block_of(name)), 5400.0)
+    assert row.lost == 0
+
+
 def test_the_samples_of_a_late_call_see_ring_and_drives_on_their_way():
     """Without a ring in them an LQG's search for the rotation takes the rhythm of the calls for a ripple."""
     block, told = block_of("lqg"), []
