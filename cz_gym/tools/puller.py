@@ -31,7 +31,7 @@ from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, make_puller
 from cz_gym.puller.file import PullerFile, defaults_of, doubts, find_puller, value_of
 from cz_gym.support.command_line import OneLineParser
 from cz_gym.support.errors import CzError
-from cz_gym.support.units import CELSIUS, HOUR, KILO, MINUTE, MM, MM_PER_MIN
+from cz_gym.support.units import CELSIUS, HOUR, KILO, MINUTE, MM, MM_PER_MIN, PERCENT
 from cz_gym.tools.posterior import explained, shown
 from cz_gym.tools.report.tables import markdown
 
@@ -133,7 +133,7 @@ def pid_numbers(puller: PullerFile) -> str:
 
 def _numbers_of(controller: Any, config: Config) -> dict[str, str]:
     """Numbers of one PID, by name."""
-    form, compensator = StandardPID.of(controller.pid), controller.compensator
+    form, compensator, heater = StandardPID.of(controller.pid), controller.compensator, controller.heater
     P, I, D = form.parallel()
     error = metrics(rollout(controller, config, VALIDATION_SEEDS[:CRYSTALS])).rmse_mm
     (mean,) = means(error[None, :, None], Resamples.draw(CRYSTALS))
@@ -157,6 +157,11 @@ def _numbers_of(controller: Any, config: Config) -> dict[str, str]:
         if compensator is None
         else f"{compensator.gain:.5g} s / ((s + "
         f"{compensator.fast:.4g})(s + {compensator.slow:.4g})) from the pull speed",
+        "heater: gain [kW/K], T_i [s] on T_1": f"{heater.K / KILO:.4g}, {heater.T_i:.5g}",
+        "heater: share of the recipe that is followed": f"{heater.share:.4g}",
+        "heater: its set point by the pull [K per %], T_i [s], filter [s]": "none"
+        if heater.K_pull == 0.0
+        else f"{heater.K_pull * PERCENT:.4g}, {heater.T_pull:.5g}, {heater.T_mean:.4g}",
         f"predicted RMSE [mm], {CRYSTALS} crystals, 95 %": mean.text(".3f"),
     }
 
