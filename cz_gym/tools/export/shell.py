@@ -137,8 +137,9 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     calm = (2.0 * distance < given["radius_limit_mm"] * MM) & (np.abs(memory.pull_bias) < FAR_PULL)
     good_time = np.where(fallen & good & seen.pyrometer & calm & ~confused, memory.good_time + dt, 0.0)
     # What an operator leaves far from nominal is brought back by the PID.
-    far_pull = np.abs(raw.v_p) > FAR_PULL * given["nominal_pull_speed_mm_per_min"] * MM_PER_MIN
-    begins_far = engaged & ~runs & (beyond | far_pull) & (wait > 0.0)
+    far = beyond | (np.abs(raw.v_p) > FAR_PULL * given["nominal_pull_speed_mm_per_min"] * MM_PER_MIN)
+    begins_far = engaged & ~runs & far & (wait > 0.0)
+    brings_back = fallen & unsure & (takeover > 0.0)
     returns = fallen & (memory.stays < 0.5) & (wait > 0.0) & (good_time >= wait)
     fallback = runs & ~returns & (fallen | (bad_readings_time > given["fallback_after_s"]) | mismatch)
     since_takeover = np.where(fallback & ~fallen | returns, 0.5 * takeover, memory.since_takeover + dt)
@@ -157,15 +158,12 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     told = read._replace(T_1=np.where(call.again, np.inf, seen.T_1 - T_1_offset), valid=read.valid / call.samples)
     observes = controller.observes
     goes_on = runs & ~corrects & ~confused & (True if observes else ~returns)
-    # A PID's heater makes the mean pull nominal: an integral that began at another one would stand in the radius for
-    # hours.
-    middle = read._replace(v_p=np.where(far_pull | returns, 0.0, read.v_p))
-    begun = controller.at_rest(read if observes else middle)
-    held = memory.controller if goes_on.all() else select(goes_on, memory.controller, begun)
+    held = memory.controller if goes_on.all() else select(goes_on, memory.controller, controller.at_rest(read))
     own = controller.step(told if estimates else read, held)
     other = own[0], own[1], memory.pid
     if (fallback | ~(finite(own[0]) & finite(own[1]))).any():
-        begun = pid.at_rest(read._replace(v_p=0.0 * read.v_p))
+        # Its heater makes the mean pull nominal: the operator's, as its integral, would stand in the radius for hours.
+        begun = pid.at_rest(read._replace(v_p=np.where(brings_back, 0.0, read.v_p)))
         other = pid.step(read, select(fallen & (memory.unsure < 0.5), memory.pid, begun))
     pull, heater = (
         np.where(fallback, second, first) / unit + at
@@ -180,7 +178,7 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     trim = FOLLOWED * constants.feed * moved + constants.trim * (bias - memory.pull_bias + dt / constants.slow * bias)
     # Any other pull than the mean one grows into the radius unseen, and the last one is none.
     no_ring = ~seen.ring.good & (fallback | (False if observes else memory.no_ring_time > NO_RING_TIME))
-    goes_back = fallen & unsure & ~corrects & (takeover > 0.0)
+    goes_back = brings_back & ~corrects
     wanted = np.where(no_ring | goes_back, nominal[0], pull), np.where(blind, old[1] + trim / KILO, heater)
     sound = finite(wanted[0]) & finite(wanted[1])
     shares = np.where(goes_back, 1.0, authority), authority
