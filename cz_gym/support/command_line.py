@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from decimal import Decimal, InvalidOperation
 from io import TextIOWrapper
 from pathlib import Path
+from shutil import get_terminal_size
+from textwrap import fill
 from typing import Any, NoReturn
 
 from gymnasium.error import DependencyNotInstalled
@@ -144,6 +146,14 @@ def missing(module: str, extra: str) -> str:
     """Return the line on a package that is not installed; ``extra`` names the extras of the command."""
     own = "." if (Path(__file__).parents[2] / "pyproject.toml").is_file() else "cz-gym"
     return f'{module} is missing: pip install "{own}[{OWN_EXTRA.get(module, extra)}]"'
+
+
+def filled(text: str, begin: str = "", rest: str = "") -> str:
+    """Return a text in lines of the terminal's width, behind ``begin`` in the first one and ``rest`` in the others."""
+    width = get_terminal_size().columns
+    return fill(
+        text, width, initial_indent=begin, subsequent_indent=rest, break_on_hyphens=False, break_long_words=False
+    )
 
 
 def relative_path(path: str | Path) -> str:

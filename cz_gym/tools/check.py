@@ -17,7 +17,7 @@ from cz_gym.env import CzVectorEnv
 from cz_gym.evaluation.protocol import GROUPS, scenarios, user_controller
 from cz_gym.evaluation.rollout import call_policy, check_policy, informed, settings_of
 from cz_gym.puller.file import chosen_puller
-from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.command_line import OneLineParser, filled
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import MICRO
 
@@ -54,7 +54,7 @@ def _main(given: argparse.Namespace) -> None:
     check_policy(policy, config)
     rows += list(check_calls(policy, config))
     for name, text in rows:
-        print(f"{name:<13} {text}")
+        print(filled(text, f"{name:<13} ", " " * 14))
     print("fits: it may run in the benchmark")
 
 

@@ -21,7 +21,7 @@ from cz_gym.episodes.scenarios import RANDOMIZED, find_scenario
 from cz_gym.evaluation.parallel import run_parallel
 from cz_gym.evaluation.protocol import scenarios
 from cz_gym.puller.file import FOLDER, PullerFile, chosen_puller
-from cz_gym.support.command_line import OneLineParser, between, relative_path
+from cz_gym.support.command_line import OneLineParser, between, filled, relative_path
 from cz_gym.support.errors import CzError, unknown_name_message
 
 TUNABLE: dict[str, TunedController] = {each.name: each for each in (*PIDS, *LQGS, *CRYSTALS)}
@@ -134,11 +134,12 @@ def for_puller(given: argparse.Namespace, puller: PullerFile) -> None:
         for number, chosen in run_parallel(search_for, tasks, poll_progress, given.cluster, folder):
             poll_progress()
             tuned = tasks[number][0]
-            bar.write(f"{tuned.name}: {tuned.objectives[OWN_PULLER].kind(**chosen.facts['figures'])}")
+            found = tuned.objectives[OWN_PULLER].kind(**chosen.facts["figures"])
+            bar.write(filled(f"{tuned.name}: {found}", rest="  "))
     command = f"cz-gym benchmark --puller {shlex.quote(str(puller.file or puller.name))}"
-    moved = "" if folder == beside else f"moved to {beside}, "
+    moved = "" if folder == beside else f"moved to {relative_path(beside)}, "
     env = "" if process == BODY else f" --env {process.name}"
-    print(f"wrote {folder}: {moved}{command}{env} runs what was designed")
+    print(f"wrote {relative_path(folder)}: {moved}{command}{env} runs what was designed")
 
 
 def search_for(task: Task) -> Trial:

@@ -230,10 +230,10 @@ def test_the_finding_tells_those_who_are_told_apart_and_says_how_much_each_moves
         (contender("agent", training_seeds=(0,)), steps(0.2, 0.3)),
     ]  # fmt: skip
     assert finding(made(cases, *who)) == (
-        "**Of those that are not told which scenario they meet, the learned agent `agent` ranks first.** The best "
-        "classical controller of them is `free`. Mean cost, which counts the radius error and the moves of both "
-        "drives: 0.2010 against 0.4020 on `randomized`; 0.2010 against 0.4020 on `hard`. Told the scenario, the best "
-        "are `told` on `randomized` (0.1005) and `told` on `hard` (0.1005). Radius error on `randomized`: `agent` "
+        "**Of the controllers that are not told which scenario they meet, the learned agent `agent` ranks first.** "
+        "The best classical controller of them is `free`. Mean cost, which counts the radius error and the moves of "
+        "both drives: 0.2010 against 0.4020 on `randomized`; 0.2010 against 0.4020 on `hard`. Told the scenario, the "
+        "best are `told` on `randomized` (0.1005) and `told` on `hard` (0.1005). Radius error on `randomized`: `agent` "
         "0.800, `free` 0.600, `told` 0.900 mm (RMSE); from sample to sample, their pull speed changes by 0.3000, "
         "0.2000 and 0.5000 mm/min (RMS). No learned agent lost a crystal."
     )

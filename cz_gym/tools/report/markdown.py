@@ -5,7 +5,6 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from shutil import get_terminal_size
-from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from cz_gym.baselines.margins import HEADS
 from cz_gym.evaluation.metrics import OUTSIDE
 from cz_gym.evaluation.protocol import BOUND, REFERENCE, Case, Contender
 from cz_gym.puller.file import DEFAULT
+from cz_gym.support.command_line import filled
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import KILO, MM, PERCENT
 from cz_gym.tools.episodes import Benchmark
@@ -177,9 +177,9 @@ def finding(benchmark: Benchmark) -> str:
     moves = [step.of(benchmark, cases[0], each.name) for each in firsts[:3]]
     kinds = ["learned agent" if each.learned else "classical controller" for each in (best, other)]
     return (
-        f"**Of those that are not told which scenario they meet, the {kinds[0]} `{best.name}` ranks first.** The best "
-        f"{kinds[1]} of them is `{other.name}`. Mean cost, which counts the radius error and the moves of both "
-        f"drives: {'; '.join(pairs)}. Told the scenario, the best are {' and '.join(aware)}. Radius error on "
+        f"**Of the controllers that are not told which scenario they meet, the {kinds[0]} `{best.name}` ranks first.** "
+        f"The best {kinds[1]} of them is `{other.name}`. Mean cost, which counts the radius error and the moves of "
+        f"both drives: {'; '.join(pairs)}. Told the scenario, the best are {' and '.join(aware)}. Radius error on "
         f"`{cases[0].name}`: {', '.join(errors)} mm (RMSE); from sample to sample, their pull speed changes by "
         "{}, {} and {} mm/min (RMS). ".format(*moves)
         + _lost_by_agents(benchmark)
@@ -312,13 +312,9 @@ def terminal(benchmark: Benchmark) -> str:
     task, graded = task_of(benchmark.cases[0]), benchmark.cases[0].tolerance is not None
     verdict = task.verdict(benchmark, tables.COST._replace(interval=False))
     parts = [_short(benchmark, case) for case in benchmark.cases]
-    parts += [_filled(verdict.sentence)] if verdict.rows or not graded else []
+    parts += [filled(verdict.sentence)] if verdict.rows or not graded else []
     parts += [_aligned(verdict.heads, verdict.rows)] if verdict.rows else []
-    return "\n\n".join(parts + ([_filled(recommendation(benchmark))] if graded else []))
-
-
-def _filled(text: str) -> str:
-    return fill(text, get_terminal_size().columns, break_on_hyphens=False, break_long_words=False)
+    return "\n\n".join(parts + ([filled(recommendation(benchmark))] if graded else []))
 
 
 def _short(benchmark: Benchmark, case: Case) -> str:
@@ -333,7 +329,7 @@ def _short(benchmark: Benchmark, case: Case) -> str:
         ]
         names = ("controller", *(column.heading for column in columns))
         heads, *lines = (tuple(line[place] for place in told) for line in (names, *full))
-    heading = _filled(f"{case.name} ({tables.crystals(len(benchmark.seeds(case)))}){grown_on}")
+    heading = filled(f"{case.name} ({tables.crystals(len(benchmark.seeds(case)))}){grown_on}")
     return f"{heading}\n{_aligned(heads, lines)}"
 
 
