@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
 from torch import nn
 
-from cz_gym.body.signals import Cost, cost_terms, saturated
+from cz_gym.body.signals import Cost, coefficients, cost_terms, saturated
 from cz_gym.config import Config
 from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.engine.tangents import DifferentiableBatch, Step, smooth
@@ -60,14 +60,17 @@ class _PlantStep(torch.autograd.Function):
 
 
 class StepCost:
-    """The cost of a step that APG follows: the reward's, but for moves that a limit of the drive cuts off.
+    """The cost of a step that APG follows: the reward's, but for moves that a drive cuts off or rounds.
 
     The pull step is the one that the action asks for, against the recipe's: the one that is taken no longer depends on
-    the action there, and a policy that asks for more than the drive does would never learn to ask for less.
+    the action there, and a policy that asks for more than the drive does would never learn to ask for less. A heater
+    that moves in whole steps costs their mean square over all places that a move may begin at: :func:`mean_square`.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, batch: DifferentiableBatch) -> None:
+        config = batch.config
         self.weights, names = config.weights, smooth(config.process)
+        self.heaters = batch._batch.memory.slots["episode"]  # rows that the batch keeps up to date
         self.drives, self.v_0 = drives_of(config.action, config.control_interval), config.parameters.v_0
         self.r_c, self.v_p, self.Q_H, self.mean = (names.index(each) for each in ("r_c", "v_p", "Q_H", "v_p_mean"))
         self.nominal = names.index("v_p_nominal") if config.process.nominal_moves else None
@@ -75,13 +78,30 @@ class StepCost:
     def __call__(
         self, before: torch.Tensor, action: torch.Tensor, after: torch.Tensor, grows: torch.Tensor, target: torch.Tensor
     ) -> torch.Tensor:
-        """The saturated sum of the four terms, shape (n,), from the states before and after; 0 if it does not grow."""
+        """The saturated sum of the four terms, shape (n,), from the states before and after; 0 if it does not grow.
+
+        Rows are those of the batch, or of several steps of it, one after the other.
+        """
         # Where the nominal speed moves, the mean is of deviations from it.
         nominal, rest = (self.v_0, 1.0) if self.nominal is None else (before[:, self.nominal], 0.0)
         asked = (self.drives.keep - 1.0) * (before[:, self.v_p] - nominal) + self.drives.pull * self.v_0 * action[:, 0]
         error, heater_step = after[:, self.r_c] - target, after[:, self.Q_H] - before[:, self.Q_H]
         terms = cost_terms(Cost(error, after[:, self.mean] / self.v_0 - rest, asked, heater_step), self.weights)
+        whole = torch.from_numpy(self.heaters["heater_step"]).repeat(len(before) // len(self.heaters))
+        squared = mean_square(heater_step, whole)
+        terms = terms._replace(heater_step=coefficients(self.weights).heater_step * squared)
         return torch.where(grows, saturated(sum(terms)), 0.0)
+
+
+def mean_square(move: torch.Tensor, whole: torch.Tensor) -> torch.Tensor:
+    """Mean square of a move that is rounded to multiples of ``whole``, over all places that it may begin at.
+
+    Shapes (n,); the square of the move itself where ``whole`` is 0. Small moves cost their size, not its square.
+    """
+    steps = move.abs() / torch.where(whole > 0.0, whole, 1.0)
+    least = steps.detach().floor()
+    rounded = whole**2 * (least**2 + (steps - least) * (2.0 * least + 1.0))
+    return torch.where(whole > 0.0, rounded, move**2)
 
 
 # A recurrent policy on "measured": leaky means of the readings, a gated recurrent unit and a small network.
@@ -298,7 +318,7 @@ class APG(BaseAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         crystals = _Crystals(self._config(), self.n_envs, self.window, [self.seed or 0, self.num_timesteps])
-        window = Window(self.policy, StepCost(self._config()), crystals.batch, self.window)
+        window = Window(self.policy, StepCost(crystals.batch), crystals.batch, self.window)
         memory = self.policy.initial_memory(self.n_envs)
         watch.on_training_start(locals(), globals())
         going, updates = True, 0

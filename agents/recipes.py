@@ -100,14 +100,15 @@ class APG(TrainingConfig):
     """Analytic policy gradients: follows the gradient of the cost through policy, memory and plant."""
 
     name: str = "gradient"
-    steps: int = 96_768_000
-    num_envs: int = 192
+    steps: int = 129_024_000
+    num_envs: int = 96
+    """Crystals at a time: at a given number of steps, more updates are worth more than more crystals."""
     learning_rate: float = 4e-3
     observation: str = "measured"
     action: str = "rate"
     window: int = 180
     """Steps of a crystal that a gradient goes back through."""
-    units: int = 64
+    units: int = 128
     """Width of the memory (a gated recurrent unit) and of the hidden layer."""
     fewest_updates: int = 400
     betas: tuple[float, float] = (0.9, 0.9)
@@ -231,7 +232,7 @@ _along: dict[str, Any] = {
 }
 CRYSTAL_RECIPES: dict[str, TrainingConfig] = {
     "ppo": PPO(name="ppo-along", **_along),
-    "gradient": APG(name="gradient-along", num_envs=96, steps=17_280_000, **_along),
+    "gradient": APG(name="gradient-along", units=64, steps=17_280_000, **_along),
 }
 """Recipes of CzCrystal-v0: one agent for crown, body and tail."""
 DEFAULT_RECIPE = "ppo"

@@ -5,7 +5,7 @@ import pytest
 import torch
 from stable_baselines3.common.env_util import make_vec_env as scalar_environments
 
-from cz_gym.agents.apg import APG, StepCost, advance
+from cz_gym.agents.apg import APG, StepCost, advance, mean_square
 from cz_gym.agents.window import Window
 from cz_gym.body.signals import SCALES, WEIGHTS, saturated
 from cz_gym.config import make_config
@@ -42,7 +42,7 @@ def some_policy(env="Cz-v0"):
 def driven(policy, batch, steps):
     """Mean cost of crystals that the policy drives."""
     state, measured = map(torch.from_numpy, batch.reset(range(batch.num_envs)))
-    memory, cost_of, costs = policy.initial_memory(batch.num_envs), StepCost(batch.config), []
+    memory, cost_of, costs = policy.initial_memory(batch.num_envs), StepCost(batch), []
     for _ in range(steps):
         action, memory = policy(measured, memory)
         before = state
@@ -94,7 +94,7 @@ def test_the_written_out_gradient_is_autograd_s(scenario, config):
     cost.backward()
     wanted = {name: parameter.grad.clone() for name, parameter in policy.named_parameters()}
     batch = DifferentiableBatch(config.with_scenario(scene), 12)
-    window, (state, measured) = Window(policy, StepCost(batch.config), batch, 60), batch.reset(range(12))
+    window, (state, measured) = Window(policy, StepCost(batch), batch, 60), batch.reset(range(12))
     window.begin(torch.from_numpy(state), policy.initial_memory(12))
     for _ in range(60):
         step = batch.step(window.act(torch.from_numpy(measured)).numpy())
@@ -115,7 +115,7 @@ def stepped(scenario, action, actions):
             each.step(np.full((4, 2), 0.02))
     before = torch.from_numpy(twin._state)
     after = advance(before, torch.from_numpy(np.float32(actions)), twin)
-    return before, after, torch.from_numpy(np.float32(actions)), batch.step(actions), StepCost(config)
+    return before, after, torch.from_numpy(np.float32(actions)), batch.step(actions), StepCost(twin)
 
 
 @pytest.mark.parametrize("action", ["rate", "smooth", "direct"])
@@ -141,13 +141,22 @@ def test_a_pull_step_that_a_limit_cuts_is_charged_as_asked():
     np.testing.assert_array_equal(np.sign(actions.grad[:, 0].numpy()), np.sign(asked[:, 0]))
 
 
+def test_a_rounded_move_costs_its_mean_square_over_all_places_that_it_may_begin_at():
+    """The oracle rounds: 10,000 places within a step."""
+    begin, move = np.linspace(0.0, 100.0, 10_000, endpoint=False), np.array([0.0, 3.0, -40.0, 100.0, 270.0, -7.0])
+    rounded = 100.0 * (np.rint((begin[:, None] + move) / 100.0) - np.rint(begin[:, None] / 100.0))
+    whole = torch.tensor([100.0] * 5 + [0.0], dtype=torch.float64)
+    wanted = np.append((rounded**2).mean(axis=0)[:5], move[5] ** 2)
+    np.testing.assert_allclose(mean_square(torch.from_numpy(move), whole), wanted, rtol=1e-3)
+
+
 def test_a_lost_crystal_costs_nothing_and_has_no_gradient():
     batch = DifferentiableBatch(CONFIG, 2)
     state, _ = map(torch.from_numpy, batch.reset(range(2)))
     batch._batch.memory.slots["x"]["r_c"][1] += 9e-3
     action = torch.zeros(2, 2, requires_grad=True)
     after, _, grows, target = advance(state, action, batch)
-    cost = StepCost(CONFIG)(state, action, after, grows, target)
+    cost = StepCost(batch)(state, action, after, grows, target)
     cost.sum().backward()
     assert grows.tolist() == [True, False]
     assert cost[1] == 0.0 < cost[0]
