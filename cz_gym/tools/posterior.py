@@ -119,12 +119,14 @@ def shown(policy: Any, config: Config) -> list[tuple[str, ...]]:
     if posterior is None or nominal is None or nominal.ring == NO_MARGIN:
         return margins.shown(policy, config)
     both = zip(nominal, quantiles(policy, config, posterior), strict=True)
-    texts = ([f"{_text(value)} ({_text(least)})" for value, least in zip(*each, strict=True)] for each in both)
-    return [(place, *cells) for place, cells in zip(PLACES, texts, strict=True)]
+    return [
+        (place, *(f"{_text(value)} ({_text(one, least == NO_MARGIN)})" for value, one in zip(own, least, strict=True)))
+        for place, (own, least) in zip(PLACES, both, strict=True)
+    ]
 
 
-def _text(value: float) -> str:
-    return f"{value:.3g}" if 0.0 < value < math.inf else "no limit"
+def _text(value: float, unstable: bool = False) -> str:
+    return "unstable" if unstable else f"{value:.3g}" if 0.0 < value < math.inf else "no limit"
 
 
 def explained(puller: PullerFile) -> str:

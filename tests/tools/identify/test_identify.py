@@ -11,7 +11,7 @@ import pytest
 
 from cz_gym import CzEnv, Parameters, make_puller
 from cz_gym.baselines.analysis import Lags as AllLags
-from cz_gym.baselines.margins import worst_margins
+from cz_gym.baselines.margins import NO_MARGIN, Openings, worst_margins
 from cz_gym.baselines.policy import OpenLoop
 from cz_gym.config import make_config
 from cz_gym.episodes.scenario import Reference
@@ -19,6 +19,7 @@ from cz_gym.puller.file import DEFAULT, find_puller, read_puller, write_puller
 from cz_gym.spaces import HEATER_RANGE, MEASURED, TargetEnv, decode
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import MM
+from cz_gym.tools import posterior
 from cz_gym.tools.identify import Excited, command, identify, read_log, record_log
 from cz_gym.tools.identify import model as model_of_log
 from cz_gym.tools.identify.command import puller_text
@@ -360,6 +361,16 @@ def test_margins_are_over_the_posterior_that_the_file_holds(found, tmp_path, cap
     (tmp_path / "my.toml").write_text("format = 1\n# identify: posterior C_1 x\n")
     with pytest.raises(CzError, match="damaged: identify the puller again"):
         Posterior.of(mine)
+
+
+def test_a_loop_that_the_posterior_makes_unstable_is_said_to_be(monkeypatch):
+    """A phase margin of 0 was printed as "no limit"."""
+    config = make_config("randomized", observation="measured", action="direct")
+    monkeypatch.setattr(posterior.Posterior, "of", lambda _: posterior)
+    monkeypatch.setattr(posterior, "quantiles", lambda *_: Openings(NO_MARGIN, NO_MARGIN, NO_MARGIN))
+    rows = posterior.shown(make_controller("lqg", config), config)
+    assert len(rows) == 3
+    assert all(cell.endswith(" (unstable)") for row in rows for cell in row[1:])
 
 
 def test_a_model_that_does_not_fit_is_no_result(logs, found, tmp_path, monkeypatch, capsys):
