@@ -3,6 +3,7 @@
 A Lagrange multiplier is the price of such a step: it rises while their share is above the limit, and falls below.
 """
 
+import argparse
 import sys
 from pathlib import Path
 from typing import Any
@@ -77,5 +78,9 @@ def main(
 
 
 if __name__ == "__main__":
-    contract, multiplier = main(int(sys.argv[1]) if sys.argv[1:] else 0)
+    parser = argparse.ArgumentParser(
+        "python -m cz_gym.examples.ppo_lagrangian", description=(__doc__ or "").split("\n")[0]
+    )
+    parser.add_argument("seed", nargs="?", type=int, default=0, help="training seed (default: 0)")
+    contract, multiplier = main(parser.parse_args().seed)
     print(f"radius error {contract.validation_rmse_mm:.3f} mm on validation crystals; multiplier {multiplier:.2f}")

@@ -3,6 +3,7 @@
 ``cz-gym benchmark --agent runs/sb3-ppo.onnx`` puts the agent into the table.
 """
 
+import argparse
 import sys
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,6 @@ def main(seed: int = 0, steps: int = 36_000_000, out: Path = Path("runs/sb3-ppo.
 
 
 if __name__ == "__main__":
-    print(
-        f"radius error {main(int(sys.argv[1]) if sys.argv[1:] else 0).validation_rmse_mm:.3f} mm on validation crystals"
-    )
+    parser = argparse.ArgumentParser("python -m cz_gym.examples.sb3_ppo", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("seed", nargs="?", type=int, default=0, help="training seed (default: 0)")
+    print(f"radius error {main(parser.parse_args().seed).validation_rmse_mm:.3f} mm on validation crystals")

@@ -2,6 +2,7 @@
 
 import inspect
 import re
+import runpy
 import subprocess
 import sys
 from dataclasses import replace
@@ -37,6 +38,16 @@ def test_the_stable_baselines_example_writes_an_agent(tmp_path):
     contract = sb3_ppo.main(steps=40_000, out=tmp_path / "some.onnx")
     assert (contract.action, contract.algorithm, contract.training_steps) == ("smooth", "sb3-ppo", 262_144)
     assert agents.load(tmp_path / "some.onnx").contract == contract
+
+
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules")
+@pytest.mark.parametrize("name", ["sb3_ppo", "ppo_lagrangian"])
+@pytest.mark.parametrize(("words", "code"), [(["--help"], 0), (["first"], 2)])
+def test_a_training_of_one_page_says_what_it_takes(name, words, code, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [name, *words])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module(f"cz_gym.examples.{name}", run_name="__main__")
+    assert ended.value.code == code
 
 
 @pytest.mark.usefixtures("few_crystals")
