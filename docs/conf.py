@@ -54,6 +54,7 @@ html_title = f"Cz-v0 {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_favicon = "_static/favicon.svg"
+html_js_files = [("access.js", {"defer": "defer"})]
 html_search_scorer = str(Path(__file__).parent / "_static" / "search.js")
 html_extra_path = ["_root"]
 html_copy_source = False

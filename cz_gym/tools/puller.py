@@ -29,11 +29,11 @@ from cz_gym.physics.meniscus import HURLE
 from cz_gym.physics.parameters import MACHINE, Parameters
 from cz_gym.physics.plant import HEIGHT_MAX_IN_A, HEIGHT_MIN, make_puller
 from cz_gym.puller.file import PullerFile, defaults_of, doubts, find_puller, value_of
-from cz_gym.support.command_line import OneLineParser
+from cz_gym.support.command_line import OneLineParser, filled
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import CELSIUS, HOUR, KILO, MINUTE, MM, MM_PER_MIN, PERCENT
 from cz_gym.tools.posterior import explained, shown
-from cz_gym.tools.report.tables import markdown
+from cz_gym.tools.report.markdown import aligned
 
 
 def implied(puller: PullerFile) -> dict[str, str]:
@@ -115,7 +115,7 @@ def margins(puller: PullerFile) -> str:
     """Margins of the controllers that are searched for a puller, as they are designed for it now, as a table."""
     config = make_config(RANDOMIZED, observation="measured", action="direct", puller=puller)
     rows = [(each.name, *row) for each in (*PIDS, *LQGS) if each.near for row in shown(each.make(config), config)]
-    return f"{markdown(('controller', *HEADS), rows)}\n\n{explained(puller)}"
+    return f"{aligned(('controller', *HEADS), rows)}\n\n{filled(explained(puller))}"
 
 
 CRYSTALS = 20
@@ -128,7 +128,7 @@ def pid_numbers(puller: PullerFile) -> str:
     named = [(each.name, each.make(config)) for each in PIDS if each.near] + [("fallback", fallback(config).pid)]
     columns = [{"": name} | _numbers_of(controller, config) for name, controller in named]
     rows = [[head, *(column[head] for column in columns)] for head in list(columns[0])[1:]]
-    return markdown(("", *(name for name, _ in named)), rows)
+    return aligned(("", *(name for name, _ in named)), [tuple(row) for row in rows])
 
 
 def _numbers_of(controller: Any, config: Config) -> dict[str, str]:
@@ -186,7 +186,7 @@ def _main(given: argparse.Namespace) -> None:
     }
     print(f"puller {puller.label}")
     for heading, text in lines.items():
-        print(f"{heading:<15} {text or 'nothing'}")
+        print(filled(text or "nothing", f"{heading:<15} ", " " * 16))
     print(f"\n{margins(puller)}")
     for doubt in doubts(puller):
         print(doubt, file=sys.stderr)

@@ -313,7 +313,7 @@ def terminal(benchmark: Benchmark) -> str:
     verdict = task.verdict(benchmark, tables.COST._replace(interval=False))
     parts = [_short(benchmark, case) for case in benchmark.cases]
     parts += [filled(verdict.sentence)] if verdict.rows or not graded else []
-    parts += [_aligned(verdict.heads, verdict.rows)] if verdict.rows else []
+    parts += [aligned(verdict.heads, verdict.rows)] if verdict.rows else []
     return "\n\n".join(parts + ([filled(recommendation(benchmark))] if graded else []))
 
 
@@ -330,11 +330,11 @@ def _short(benchmark: Benchmark, case: Case) -> str:
         names = ("controller", *(column.heading for column in columns))
         heads, *lines = (tuple(line[place] for place in told) for line in (names, *full))
     heading = filled(f"{case.name} ({tables.crystals(len(benchmark.seeds(case)))}){grown_on}")
-    return f"{heading}\n{_aligned(heads, lines)}"
+    return f"{heading}\n{aligned(heads, lines)}"
 
 
-def _aligned(heads: Sequence[str], lines: Iterable[tuple[str, ...]]) -> str:
-    """A table in columns of characters, its units in a line of their own.
+def aligned(heads: Sequence[str], lines: Iterable[tuple[str, ...]]) -> str:
+    """Return a table in columns of characters, its units in a line of their own.
 
     Columns that the terminal has no room for follow below, beside the names again.
     """
