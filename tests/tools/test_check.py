@@ -56,7 +56,7 @@ def test_an_agent_that_fits_is_described(capsys):
     told = capsys.readouterr().out
     for line in (
         r"environment +Cz-v0, puller default, plant \w{16}", r"observation +measured", r"action +rate",
-        r"interval +5 s", r"declared +\d\d,\d{3},\d{3} steps, seed \d, learned, plant known in training",
+        r"interval +5 s", r"declared +\d{2,3},\d{3},\d{3} steps, seed \d, learned, plant known in training",
         r"shapes +\(12,\) to \(2,\)", r"state +\d+ bytes a crystal", r"memory +[\d.]+ MB", r"speed +\d+ us a step",
     ):  # fmt: skip
         assert re.search(rf"^{line}", told, re.MULTILINE), line

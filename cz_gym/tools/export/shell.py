@@ -139,7 +139,8 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     # What an operator leaves far from nominal is brought back by the PID.
     far = beyond | (np.abs(raw.v_p) > FAR_PULL * given["nominal_pull_speed_mm_per_min"] * MM_PER_MIN)
     begins_far = engaged & ~runs & far & (wait > 0.0)
-    brings_back = fallen & unsure & (takeover > 0.0)
+    gradual = drives[0].slew * (dt / MINUTE) <= FAR_PULL * drives[0].nominal  # any other drive would jump there
+    brings_back = fallen & unsure & (takeover > 0.0) & gradual
     returns = fallen & (memory.stays < 0.5) & (wait > 0.0) & (good_time >= wait)
     fallback = runs & ~returns & (fallen | (bad_readings_time > given["fallback_after_s"]) | mismatch)
     since_takeover = np.where(fallback & ~fallen | returns, 0.5 * takeover, memory.since_takeover + dt)
