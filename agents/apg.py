@@ -180,6 +180,25 @@ class RecurrentPolicy(BasePolicy):
         action = (self.linear(y) + self.output(torch.tanh(self.layer(y)))) * self.gains
         return action, torch.cat([means, h], dim=1)
 
+    def take_weights(self, content: bytes) -> None:
+        """Take the weights of an agent file, ONNX ``content``, that such a policy was written to; CzError if it was
+        not, or has other widths."""
+        import onnx  # comes with the extra "agents"
+
+        graph = onnx.load_from_string(content).graph
+        tensors = {each.name: torch.tensor(onnx.numpy_helper.to_array(each)) for each in graph.initializer}
+        products = {node.output[0]: node.input[1] for node in graph.node if node.op_type == "MatMul"}
+        names = {name: f"policy.{name}" for name in self.state_dict()}
+        if (product := products.get("/policy/output/MatMul_output_0")) is not None:  # written as its transpose
+            names["output.weight"], tensors[product] = product, tensors[product].T
+        try:
+            self.load_state_dict({name: tensors[own] for name, own in names.items()})
+        except KeyError:
+            raise CzError("not the network of an agent that APG trained") from None
+        except RuntimeError:
+            units = tensors["policy.gru.weight_hh"].shape[1]
+            raise CzError(f"has a memory of {units} units, not {self.gru.hidden_size}: --set units={units}") from None
+
     def observe_statistics(self, features: torch.Tensor) -> None:
         """Move mean and standard deviation of the features towards those of a sample, shape (samples, features)."""
         rate = STATISTICS_RATE if bool(self.mean.any()) else 1.0
@@ -245,7 +264,7 @@ def leaky_means(interval: float, process: Process) -> tuple[npt.NDArray[Any], np
 # equations while it trains; the policy reads sensors alone.
 
 WARM_UP = 0.05
-"""Share of the training during which the features' statistics are updated."""
+"""Share of a training from random weights during which the features' statistics are updated."""
 CLIP_AT = 2.0
 """Gradient-norm clip, in multiples of the running median norm: the gradient of a crystal that is nearly lost is
 thousands of times as large."""
@@ -259,6 +278,7 @@ class APG(BaseAlgorithm):
     ``env`` says what is learned: a vector environment with ``observation="measured"``. Training steps a
     differentiable twin of it with as many slots; ``env`` itself is only asked for its settings. ``window`` is the
     number of steps that a gradient goes back through; each update takes ``window * num_envs`` environment steps.
+    During the first share ``warm_up`` of the training the mean and standard deviation of the features are updated.
     The cost is :class:`StepCost`; a constant ``learning_rate`` falls linearly to 0.
     The other arguments are stable-baselines3's. Raises CzError for an environment that is not this package's, or reads
     another observation.
@@ -273,6 +293,7 @@ class APG(BaseAlgorithm):
         env: GymEnv | str | None,
         learning_rate: float | Schedule = 4e-3,
         window: int = 180,
+        warm_up: float = WARM_UP,
         device: torch.device | str = "cpu",
         _init_setup_model: bool = True,
         **options: Any,
@@ -284,7 +305,7 @@ class APG(BaseAlgorithm):
                 return initial * left
 
         super().__init__(policy, env, learning_rate, device=device, support_multi_env=True, **options)
-        self.window = window
+        self.window, self.warm_up = window, warm_up
         self.norms = torch.zeros(NORMS)
         if _init_setup_model:
             self._setup_model()
@@ -344,7 +365,7 @@ class APG(BaseAlgorithm):
     def _grow(self, crystals: "_Crystals", memory: torch.Tensor, window: Window, watch: BaseCallback) -> bool:
         """Drive every crystal through a window: whether to go on."""
         policy, going, seen = self.policy, True, []
-        warm = self._current_progress_remaining > 1.0 - WARM_UP
+        warm = self._current_progress_remaining > 1.0 - self.warm_up
         window.begin(torch.from_numpy(crystals.state), memory)
         for _ in range(self.window):
             action = window.act(torch.from_numpy(crystals.measured))

@@ -27,9 +27,9 @@ from cz_gym.evaluation.metrics import Metrics, metrics
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS, scenarios
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.sb3 import ActionRepeat, AddToController, CzVecEnv
-from cz_gym.support.errors import require_type
+from cz_gym.support.errors import CzError, require_type
 
-from . import apg
+from . import OnnxPolicy, apg, load
 from .asymmetric import AsymmetricPolicy, AsymmetricSACPolicy
 from .contract import Contract
 from .residual import Base, Residual
@@ -76,6 +76,11 @@ class TrainingConfig:
         raise NotImplementedError
 
     @property
+    def steps_before(self) -> int:
+        """Environment steps that the agent which the training begins with has learned for; 0 for random weights."""
+        return 0
+
+    @property
     def updates(self) -> int:
         """Number of updates in the budget."""
         return self.steps // (self.num_envs * self.steps_between)
@@ -108,6 +113,8 @@ class APG(TrainingConfig):
     action: str = "rate"
     window: int = 180
     """Steps of a crystal that a gradient goes back through."""
+    start: str = ""
+    """Agent whose weights are learned on, a shipped one's name or a file; empty: random weights."""
     units: int = 128
     """Width of the memory (a gated recurrent unit) and of the hidden layer."""
     fewest_updates: int = 400
@@ -119,6 +126,23 @@ class APG(TrainingConfig):
     def steps_between(self) -> int:
         """Length of the window."""
         return self.window
+
+    @property
+    def steps_before(self) -> int:
+        """Environment steps of the agent of ``start``."""
+        agent = self.begun_with
+        return agent.contract.training_steps if agent else 0
+
+    @property
+    def begun_with(self) -> OnnxPolicy | None:
+        """The agent of ``start``; CzError if the recipe's agents read, act or grow otherwise."""
+        if not self.start:
+            return None
+        agent, environment = load(self.start), self.environment or BODY_ENV
+        for what, own in (("environment", environment), ("observation", self.observation), ("action", self.action)):
+            if (its := getattr(agent.contract, what)) != own:
+                raise CzError(f"start={self.start}: its {what} is {its}, the recipe's is {own}")
+        return agent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,9 +291,16 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base 
     if isinstance(recipe, Reinforcement):
         settings["learning_rate"] = partial(linear_schedule, recipe.learning_rate)
         options["net_arch"] = {"pi": list(recipe.hidden), critics: list(recipe.critic_hidden)}
+    if isinstance(recipe, APG) and recipe.start:
+        settings["warm_up"] = 0.0
     if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer
         settings["learning_starts"] += done // recipe.action_repeat
     made: BaseAlgorithm = kind(policy, env, policy_kwargs=options, seed=seed, device="cpu", **settings)
+    if isinstance(made, apg.APG) and (agent := recipe.begun_with):
+        try:
+            made.policy.take_weights(agent.content)
+        except CzError as error:
+            raise CzError(f"start={recipe.start}: {error}") from None
     # The algorithm's constructor has set the slots' seeds to ``seed`` and those after it: neighbouring training seeds
     # would meet the same crystals, and a resumed run its first ones again.
     made.set_random_seed((seed * 10_007 + done) % (len(TRAINING_SEEDS) - recipe.num_envs))

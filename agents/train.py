@@ -308,7 +308,7 @@ class TrainingRun:
 
     def _keep_agent(self, agent: OnnxPolicy, figures: recipes.Validation) -> None:
         """Put an agent with its figures into the next checkpoint."""
-        contract = figures.put_into(replace(agent.contract, training_steps=self.steps))
+        contract = figures.put_into(replace(agent.contract, training_steps=self.steps + self.recipe.steps_before))
         files = agent_files(self.folder / "agent.onnx", agent.content, contract)
         self.files |= {path.name: content for path, content in files.items()}
 

@@ -1,11 +1,16 @@
 """Analytic policy gradients: the gradient is that of differences, and the interface stable-baselines3's."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from stable_baselines3.common.env_util import make_vec_env as scalar_environments
+from stable_baselines3.common.logger import configure
 
+from cz_gym import agents
 from cz_gym.agents.apg import APG, StepCost, advance, mean_square
+from cz_gym.agents.recipes import RECIPES, make_algorithm
 from cz_gym.agents.window import Window
 from cz_gym.body.signals import SCALES, WEIGHTS, saturated
 from cz_gym.config import make_config
@@ -236,3 +241,32 @@ def test_apg_lowers_the_cost_in_a_few_updates():
     before = driven(model.policy, batch, 720).item()
     model.learn(24 * 90 * 60)
     assert driven(model.policy, batch, 720).item() < 0.5 * before
+
+
+def test_a_training_goes_on_from_an_agents_weights(tmp_path):
+    """Before the first update the policy acts as the agent does, and the features keep their statistics."""
+    recipe = replace(RECIPES["gradient"], start="gradient", num_envs=8)
+    begun, agent = make_algorithm(recipe, 0), agents.load("gradient")
+    seen = np.random.default_rng(0).normal(0.0, 0.1, (4, 12)).astype(np.float32)
+    memory, mean = np.full((4, 160), 0.1, np.float32), begun.policy.mean.clone()
+    np.testing.assert_allclose(begun.predict(seen, memory)[0], agent.predict(seen, memory)[0], atol=1e-6)
+    assert begun.warm_up == 0.0
+    assert recipe.steps_before == agent.contract.training_steps
+    begun.set_logger(configure(None, []))
+    begun.learn(8 * 180)
+    assert torch.equal(begun.policy.mean, mean)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"units": 64}, "a memory of 128 units, not 64: --set units=128"),
+        ({"start": "ppo"}, "its observation is history, the recipe's is measured"),
+        ({"start": "gradient-along"}, "its environment is CzCrystal-v0, the recipe's is Cz-v0"),
+        ({"start": "nobody"}, "unknown shipped agent"),
+    ],
+)
+def test_an_agent_that_cannot_be_learned_on_is_refused(fields, message):
+    """In one line that says what differs."""
+    with pytest.raises(CzError, match=message):
+        make_algorithm(replace(RECIPES["gradient"], **{"start": "gradient", "num_envs": 8} | fields), 0)
