@@ -39,7 +39,7 @@ class Layout(NamedTuple):
     """The channels that an asymmetric policy is given."""
 
     history: tuple[Channel, ...]
-    """Those of "history", after those of :data:`cz_gym.agents.residual.ADDED` if the agent adds to a controller."""
+    """Channels of "history", after those of :data:`cz_gym.agents.residual.ADDED` if the agent adds to a controller."""
     state: tuple[Channel, ...]
     present: int
     """Number of channels of "history" that show the present; the last one is the integral of the ring error."""

@@ -46,25 +46,25 @@ class Contract:
     """An agent's observation, the meaning of its actions, and its training."""
 
     observation: str
-    """Name of the observation that it reads."""
+    """Name of the observation that the agent reads."""
     channels: int
-    """Length of that observation."""
+    """Length of the observation."""
     observation_hash: str
-    """Hash of that observation's channels: their names, units and scales, in order."""
+    """Hash of the observation's channels: their names, units and scales, in order."""
     action: str
-    """Meaning of its actions: "direct", "smooth" or "rate" (:func:`cz_gym.spaces.drives_of`)."""
+    """Meaning of the actions: "direct", "smooth" or "rate" (:func:`cz_gym.spaces.drives_of`)."""
     control_interval: float
-    """Time between its actions [s]."""
+    """Time between actions [s]."""
     plant_hash: str
-    """Hash of the nominal plant it was trained on."""
+    """Hash of the nominal plant of the training."""
     reward_hash: str
-    """Hash of the reward that it was trained and validated with (:attr:`cz_gym.config.Config.reward_hash`)."""
+    """Hash of the reward of training and validation (:attr:`cz_gym.config.Config.reward_hash`)."""
     scenario: str
-    """Scenario, or shares of scenarios, that it was trained on."""
+    """Scenario of the training, or shares of scenarios."""
     scenario_hash: str
-    """Hash of that scenario."""
+    """Hash of the training's scenario."""
     algorithm: str
-    """Name of the recipe that trained it."""
+    """Name of the training recipe."""
     learned_from: str
     """Source of the learning, in words of :mod:`cz_gym.evaluation.protocol`: REWARD, STATE or PLANT."""
     training_seed: int
@@ -74,15 +74,15 @@ class Contract:
     validation_cost: float
     """Mean cost of a step [-] on the validation episodes that choose no agent."""
     validation_rmse_mm: float
-    """Mean RMSE on the same episodes [mm]."""
+    """Mean RMSE on the validation episodes that choose no agent [mm]."""
     sha256: str
     """Hash of the ONNX file."""
     puller: str = DEFAULT.label
-    """Name and hash of the puller file that it was trained for (:attr:`cz_gym.puller.file.PullerFile.label`)."""
+    """Name and hash of the training's puller file (:attr:`cz_gym.puller.file.PullerFile.label`)."""
     environment: str = "Cz-v0"
-    """Name of the environment that it was trained in."""
+    """Name of the training's environment."""
     controller: str = ALONE
-    """Name and hash of the controller that its actions are added to."""
+    """Name and hash of the controller that the actions are added to."""
     pull_limit: float = 0.0
     """Largest addition to that controller's pull speed, as a share of v_0 [-]."""
     heater_limit: float = 0.0

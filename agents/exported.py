@@ -307,17 +307,18 @@ class _Rebuilt:
         elif operator not in ELEMENTWISE or not self._alike(node):
             for name in (*(name for name in node.input if name in self.rows), *results):
                 self._length(name)
-        if results[0] in self.rows:
-            return
+        if results[0] not in self.rows:
+            self.rows[results[0]] = self._result_of(node, attributes)
+
+    def _result_of(self, node: Any, attributes: dict[str, Any]) -> Any:
+        """Rebuild an operation on rows; return its result."""
+        operator, first = node.op_type, node.input[0]
         if operator in _OTHERS:
-            x = self.rows[first]
             values = [self._operand(name) for name in node.input[1:]]
-            self.rows[results[0]] = _OTHERS[operator](self, x, values, attributes, self._length(first))
-            return
+            return _OTHERS[operator](self, self.rows[first], values, attributes, self._length(first))
         if "axis" in attributes and self._is_row_axis(first, attributes["axis"]):
             attributes["axis"] = -1
-        operands = [self._operand(name) for name in node.input]
-        self.rows[results[0]] = self._emit(operator, operands, **attributes)
+        return self._emit(operator, [self._operand(name) for name in node.input], **attributes)
 
     def _alike(self, node: Any) -> bool:
         """Tell whether the operands of a node are of one shape, but for single numbers."""
@@ -453,14 +454,19 @@ def _lengths(operator: str, parts: list[list[Any]]) -> list[Any]:
     if operator in ("Equal", "Where"):
         columns = zip(*(part * max(map(len, parts)) if len(part) == 1 else part for part in parts), strict=True)
         return [column[0] == column[1] if operator == "Equal" else column[1 if column[0] else 2] for column in columns]
+    return [_length_of(operator, parts)]
+
+
+def _length_of(operator: str, parts: list[list[Any]]) -> Any:
+    """Compute with two single lengths; the number of pullers, "n", may be multiplied by one alone."""
     if operator not in ARITHMETIC or any(len(part) != 1 for part in parts):
         raise GraphError(f"computes with the number of pullers, in {operator}")
     (a,), (b,) = parts
     if "n" not in (a, b):
-        return [ARITHMETIC[operator](a, b)]
+        return ARITHMETIC[operator](a, b)
     if operator != "Mul" or 1 not in (a, b):
         raise GraphError("computes with the number of pullers")
-    return ["n"]
+    return "n"
 
 
 def _some_inputs(graph: Any) -> dict[str, Any]:

@@ -48,7 +48,7 @@ class ResidualMemory(NamedTuple):
     own: Any
     """The controller's own memory."""
     asked: npt.NDArray[Any]
-    """Its last actions."""
+    """Last actions of the controller."""
     share: npt.NDArray[np.float32]
     """Shares of the limits that are in force [-]."""
 

@@ -73,7 +73,7 @@ class Checkpoint(NamedTuple):
     parameters: dict[str, Any]
     """State of each network and optimiser, by name (stable-baselines3's ``get_parameters``)."""
     variables: dict[str, torch.Tensor]
-    """Tensors that belong to none of them, by name."""
+    """Tensors that belong to no network or optimiser, by name."""
     files: dict[str, bytes]
     """The run's other files, by name."""
 
@@ -149,7 +149,7 @@ class TrainingRun:
     checkpoint_seconds: float = 60.0
     """Longest time between checkpoints, apart from validations and updates in between [s]."""
     plot: bool = False
-    """Whether to draw the progress into the folder."""
+    """True if the progress is drawn into the folder."""
     callbacks: tuple[str, ...] = ()
     """Places FILE.py:NAME of the user's callbacks."""
     base: Base | None = None

@@ -36,7 +36,7 @@ _SMALL = 1e-6
 _SEEN = ("ring_error", "T_1", "v_p", "Q_H")
 """Channels through which the plant reaches the controller."""
 SEEN = [Measured._fields.index(name) for name in _SEEN]
-"""Their places in an observation."""
+"""Places in an observation of the channels through which the plant reaches the controller."""
 _AT_REST = np.array([float(channel.name == "valid") for channel in MEASURED])
 """Observation at rest: zeros and a valid camera."""
 _DISTURBED = ("v_p", "Q_H", "camera")
@@ -249,7 +249,7 @@ class Margins(NamedTuple):
     crossover: float
     """Frequency where the loop's gain is one [rad/s]."""
     phase_margin_deg: float
-    """Phase above -180 degrees there [degrees]."""
+    """Phase above -180 degrees at the crossover [degrees]."""
     poles: npt.NDArray[np.complex128]
     """Closed-loop poles, slowest first [rad/s]."""
 
@@ -358,7 +358,7 @@ def loop_margins(
     stable: bool | None = None,
     points: int = 2000,
 ) -> LoopMargins:
-    """Margins of the loop opened there, on a grid; all but the crossover are NaN if it is not ``stable``."""
+    """Margins of a loop opened at a place, on a grid; all but the crossover are NaN if it is not ``stable``."""
     import control
 
     omega = frequencies(dt, points)

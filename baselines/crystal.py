@@ -54,7 +54,7 @@ class CrystalPIDMemory(NamedTuple):
     by_edge: Floats
     """1 if the last good frame showed the edge, 0 if the ring."""
     shift: Floats
-    """What is left of the jump from one reading to the other [m]."""
+    """Rest of the jump between the readings of ring and edge [m]."""
     share: Floats
     """Share of the edge's gain in the gain of now [-]."""
     pid: PIDState
@@ -87,7 +87,7 @@ class CrystalPID(MeasuredController):
     T_turn: float = 120.0
     """Time constant with which the difference of ring and edge dies out [s]."""
     compensates: bool = True
-    """Takes the predicted height off the ring."""
+    """True if the predicted height is taken off the ring."""
     lam: float = 0.5
     """Share of conduction in its model [-]."""
     slow: float = 2.0e-4
@@ -177,7 +177,7 @@ SIZES = np.array([MM, MM, *[1.0] * 6, 0.1, MM_PER_MIN, KILO])
 """Sizes of the states and the drives, in SI units."""
 _RING, _PYROMETER, _WEIGHT, _EDGE = range(4)
 SENSORS = ("ring", "pyrometer", "weight", "edge")
-"""What is seen, in this order: ring [m], heater [K], load cell [N], edge [m]."""
+"""Readings in their order: ring [m], heater [K], load cell [N], edge [m]."""
 START_SD = np.array([0.2 * MM, 0.2 * MM, 1.0, 1.0, 0.3, 0.3, 1.0, 1.0, 0.01])
 """Standard deviations of the states when an episode begins, in SI units."""
 
@@ -329,7 +329,7 @@ class CrystalLQG(MeasuredController):
     process: ClassVar[Process] = CRYSTAL
 
     models: tuple[float, ...] = (0.0, 0.1, 0.35, 0.9)
-    """Shares of conduction that it considers possible [-]."""
+    """Shares of conduction that the controller considers possible [-]."""
     forgets: float = 2.0 * HOUR
     """Time after which a model's mistakes are forgotten [s]."""
     noise: CrystalNoise = field(default_factory=CrystalNoise)
@@ -337,7 +337,7 @@ class CrystalLQG(MeasuredController):
     jump: float = 1.0 * MM
     """Largest innovation of ring and edge that counts [m]."""
     sensors: tuple[str, ...] = SENSORS
-    """Those of :data:`SENSORS` that it reads."""
+    """Readings of :data:`SENSORS` that the filter uses."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -143,7 +143,7 @@ class LQGDesign:
     lam: float = 0.5
     """Share of conduction at the design point [-]."""
     R: float = 0.0
-    """Boundary layer that it expects under the crystal, beside the puller's own [m2 K/W]."""
+    """Boundary layer that the filter expects under the crystal, beside the puller's own [m2 K/W]."""
     nonlinear: bool = True
     """Predicts with the plant's equations; False: with the linearised ones."""
     gate: float = 4.0
@@ -425,7 +425,7 @@ def _drift(Q_d: Floats, p: Any) -> Floats:
 
 
 def privileged(plain: LQG, knows_fluctuations: bool = True) -> PrivilegedLQG:
-    """Bound: that LQG with each puller's parameters and, by default, the strength of each crystal's fluctuations."""
+    """Bound: an LQG with each puller's parameters and, by default, the strength of each crystal's fluctuations."""
     known = {each.name: getattr(plain, each.name) for each in fields(plain) if each.name != "hypotheses"}
     return PrivilegedLQG(**known, knows_fluctuations=knows_fluctuations)
 

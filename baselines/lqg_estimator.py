@@ -219,7 +219,7 @@ class Hypotheses:
     fast_sd: tuple[float, ...] = (0.1, 0.3, 0.5)
     """Standard deviations of the fast interface fluctuation [K]."""
     slow_sd: tuple[float, ...] = (0.15, 0.35)
-    """Standard deviations of the slow one [K]; with 0.6 the heater chases the radius and slow drives lose crystals."""
+    """Standard deviations of the slow interface fluctuation [K]; with 0.6 slow drives lose crystals."""
 
     @property
     def count(self) -> int:

@@ -107,17 +107,17 @@ class NoiseModel:
     camera_sd: float = 0.025 * MM
     """Initial estimate of the camera noise's standard deviation [m]."""
     camera_sd_range: tuple[float, float] = (0.005 * MM, 0.2 * MM)
-    """Lower and upper limit of that estimate [m]."""
+    """Limits of the estimated standard deviation of the camera's noise [m]."""
     camera_memory: float = 10.0 * MINUTE
-    """Averaging time of that estimate [s]; infinite for a constant one."""
+    """Averaging time of the estimated camera noise [s]; infinite for a constant one."""
     pyrometer_sd: float = 0.1
     """Standard deviation of the pyrometer's noise [K]."""
     start_radius_sd: float = 0.2 * MM
     """Standard deviation of the initial radius [m]."""
     told_power_sd: float = 0.0
-    """Standard deviation of the nominal power that it is told, and of the power's reading [W]."""
+    """Standard deviation of the told nominal power, and of the power's reading [W]."""
     told_temperature_sd: float = 0.0
-    """Standard deviation of the nominal temperature that it is told [K]."""
+    """Standard deviation of the told nominal temperature [K]."""
 
     def __post_init__(self) -> None:
         taus = ("fast_tau", "slow_tau", "drift_rate_tau", "camera_memory")
@@ -221,7 +221,7 @@ RIPPLE_STATES = slice(RIPPLE, RIPPLE + 2)
 
 @dataclass(frozen=True)
 class RingModel:
-    """The numbers of such a camera, and of the search for the ripple's frequency."""
+    """Numbers of a camera with latency or ripple, and of the search for the ripple's frequency."""
 
     latency: float = 0.0
     """Age of a frame when it is delivered [s]."""

@@ -36,7 +36,7 @@ _OFF = -2.0
 
 
 class Margin(NamedTuple):
-    """Margins of one opening; infinite, or zero for ``gain_down``, where no such change destabilises the loop."""
+    """Margins of one opening; infinite, or zero for ``gain_down``, where no such change destabilises it."""
 
     gain_up: float
     """Factor by which the gain may grow [-]."""
@@ -73,9 +73,9 @@ class MarginLimits(NamedTuple):
     gain: float = 2.0
     """Factor by which the gain may grow, or be divided [-]."""
     phase: float = 30.0
-    """[degrees]"""
+    """Phase margin [degrees]."""
     peak: float = 2.0
-    """[-]"""
+    """Peak of the sensitivity [-]."""
 
     def slacks(self, openings: Openings) -> tuple[float, ...]:
         """Relative slacks of gain, phase and peak at the worst opening [-]; negative beyond a limit."""

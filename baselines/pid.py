@@ -69,7 +69,7 @@ class StandardPID(NamedTuple):
     """The same law as u = gain (1 + 1/(T_i s) + T_d s/(filter_share T_d s + 1)) e, the ISA form of most PLCs."""
 
     gain: float
-    """[1/s]"""
+    """Gain of the whole law [1/s]."""
     T_i: float
     """Integral time [s]."""
     T_d: float

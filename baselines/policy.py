@@ -53,9 +53,9 @@ class DriveLimits(NamedTuple):
     pull_window: float = math.inf
     """Largest |v_p - v_0| [m/s]."""
     pull_slew: float = math.inf
-    """[m/s2]."""
+    """Largest rate of the pull speed [m/s2]."""
     heater_slew: float = math.inf
-    """[W/s]."""
+    """Largest rate of the heater power [W/s]."""
     heater_step: float = 0.0
     """Whole steps in which the heater moves [W]; 0: none."""
 
@@ -80,7 +80,7 @@ class ControllerState(NamedTuple):
     asked: Floats
     """Last setpoints within the drives' limits, deviations from nominal [m/s, W], shape (n, 2)."""
     difference: Floats
-    """Readings of the drives minus these, averaged over :data:`DIFFERENCE_TIME`, shape (n, 2)."""
+    """Readings of the drives minus the setpoints, averaged over :data:`DIFFERENCE_TIME`, shape (n, 2)."""
     memory: Any
     """The controller's own memory."""
 
@@ -113,9 +113,9 @@ class MeasuredController(ABC):
     meniscus: MeniscusModel = field(default=HURLE, kw_only=True)
     """Meniscus of the nominal puller."""
     puller: PullerFile = field(default=DEFAULT, kw_only=True)
-    """The machine that it is for."""
+    """Puller file of the machine."""
     limits: DriveLimits = field(default=DriveLimits(), kw_only=True)
-    """Limits of its drives."""
+    """Limits of the puller's drives."""
     any_environment: bool = field(default=False, kw_only=True)
     """Lets every environment take the actions (``made_for`` is None)."""
 

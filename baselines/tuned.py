@@ -39,7 +39,7 @@ MUST_COVER = {
 }
 """Fields, by family, in which a tuned scenario must be as demanding as the one that its settings serve."""
 PREFER_COVER = {"interface": ("sd",), "sensor": ("camera_noise", "pyrometer_noise")}
-"""Fields in which it should be, if there is such a tuned scenario."""
+"""Fields in which the tuned scenario should be as demanding too, if there is such a one."""
 
 
 def file_name(controller: str, scenario: str) -> str:
@@ -253,7 +253,7 @@ class TunedController:
     parameters: tuple[Parameter, ...]
     """Numbers that a search varies."""
     robust: tuple[Parameter, ...] = ()
-    """Numbers that it varies too on scenarios that are more demanding than ``randomized``."""
+    """Numbers that a search varies too on scenarios that are more demanding than ``randomized``."""
     near: tuple[Parameter, ...] = ()
     """Numbers that ``cz-gym tune --puller`` varies around the scaled settings; none: it leaves the controller out."""
     objectives: Mapping[str, Objective] = field(hash=False)

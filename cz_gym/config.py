@@ -36,19 +36,19 @@ class Identity(NamedTuple):
     """The settings that a saved state depends on: environments in which they are equal continue each other's states."""
 
     version: int
-    """:data:`VERSION`."""
+    """Version of the environment's contract."""
     plant: str
-    """:attr:`Config.plant_hash`."""
+    """Hash of the plant (:attr:`Config.plant_hash`)."""
     scenario: str
-    """Name and hash."""
+    """Name and hash of the scenario."""
     mix: Range
     """Range of the share of conduction [-]."""
     observation: str
     action: str
     control_interval: float
-    """[s]."""
+    """Time between actions [s]."""
     horizon: float
-    """[s]."""
+    """Length of an episode [s]."""
     puller: str = DEFAULT.label
     """Name and hash of the puller file."""
     weights: str = ""
@@ -142,7 +142,7 @@ class Config:
 
     @property
     def made_for(self) -> TargetEnv:
-        """The environment as controllers and agents name the one that they were made for."""
+        """Record of this environment that controllers and agents made for it keep."""
         return TargetEnv(self.action, self.control_interval, self.plant_hash, self.puller.label)
 
     @property

@@ -69,7 +69,7 @@ class Past(NamedTuple):
 
 
 class Relative(NamedTuple):
-    """How "history" shows a signal relative to another one."""
+    """Signal that "history" shows relative to another one."""
 
     name: str
     to: str
@@ -105,7 +105,7 @@ class PerfectReadings(NamedTuple):
     ring: Any
     """Radius of the bright ring [m]."""
     reading: Any
-    """The same less the operator's bias [m]."""
+    """Radius of the bright ring less the operator's bias [m]."""
     h_c: Any
     """Height of the meniscus within its limits [m]."""
     T_1: Any
@@ -116,9 +116,9 @@ class Readings(NamedTuple):
     """The sensors' last readings, in fields of the slot."""
 
     ring: Any
-    """The camera's of the bright ring, less the operator's bias [m]."""
+    """Camera's reading of the bright ring, less the operator's bias [m]."""
     T_1: Any
-    """The pyrometer's [K]."""
+    """Pyrometer's reading of the heater temperature [K]."""
 
 
 class NoMemory(NamedTuple):
@@ -133,14 +133,14 @@ def keep_memory(memory: Any, u: Any, nominal: Any, interval: Any) -> Any:
 
 @jittable
 def no_sensors(slot: Any, m: Any) -> None:
-    """A process that camera and pyrometer alone see."""
+    """Write nothing: camera and pyrometer are the only sensors."""
 
 
 class InImage(NamedTuple):
     """A slot's crystal in the camera's image."""
 
     r_c: Any
-    """Its radius by the last reading [m]; NaN: the image is black."""
+    """Radius of the crystal by the last reading [m]; NaN: the image is black."""
     inwards: Any
     """Distance of the image's middle from the optical axis, towards the crystal's [m]."""
 

@@ -157,7 +157,7 @@ class CzVecEnv(VecEnv):
         return [self.slots[i] for i in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """The native batch does not render."""
+        """None for each slot: the native batch does not render."""
         return [None] * self.num_envs
 
 
@@ -234,9 +234,9 @@ class ActionRepeat(VecEnvWrapper):
 
 
 class AddToController(VecEnvWrapper):
-    """Actions are added to those of a controller, which runs in the batch (:class:`cz_gym.agents.residual.Residual`).
+    """Adds actions to those of a controller, which runs in the batch (:class:`cz_gym.agents.residual.Residual`).
 
-    Its channels stand before those of the observation. It acts at every step: repeat actions around this wrapper.
+    The controller's channels come first in the observation. It acts at every step: repeat actions around this wrapper.
     """
 
     def __init__(self, venv: VecEnv, residual: Any) -> None:

@@ -46,7 +46,7 @@ class Row(NamedTuple):
     python: Sequence[float]
     """Python's row of the table: RMSE [mm] and pull step RMS [mm/min], rounded as there; crystals lost."""
     c: Sequence[float]
-    """Those figures with the C in place of Python."""
+    """Row of the table with the C in place of Python: RMSE [mm], pull step RMS [mm/min], crystals lost."""
     rounded: Sequence[float] | None = None
     """Row, where it differs, of C in double precision whose setpoints alone are rounded to single precision."""
 

@@ -49,7 +49,7 @@ FULL, STEPS = (2.4, 20.0), (0.01, 0.1)
 """Full ranges of pull speed [mm/min] and heater power [kW], and largest resolutions of their readings."""
 DRIVES = tuple(SETPOINT_NAMES.values())
 TAKEN_OVER = 10.0 * MINUTE
-"""When a block takes over from an operator [s]."""
+"""Time at which a block takes over from an operator [s]."""
 SETTLED = 0.5 * HOUR
 """Time from which errors count [s]."""
 
@@ -186,16 +186,8 @@ class Faulty:
             return self.held, memory
         self.due = time + self.fault.pace[self.calls % len(self.fault.pace)] * self.dt
         self.calls += 1
-        given = dict(inputs) | {"ring_time_s": np.asarray(inputs["time_s"]) - self.latency} | self.off | drives
-        if self.fault.pyrometer and GONE[0] <= time < GONE[1]:
-            given["T_1_K"] = self.fault.pyrometer(inputs["T_1_K"], self.seen)
-        else:
-            self.seen = inputs["T_1_K"]
-        given["T_1_K"] = given["T_1_K"] + self.fault.drift * time / HOUR
-        if self.fault.ring and STEP <= time < self.fault.ring_ends:
-            given["ring_radius_mm"] = self.fault.ring(inputs["ring_radius_mm"], self.ring)
-        else:
-            self.ring = inputs["ring_radius_mm"]
+        ring_time = {"ring_time_s": np.asarray(inputs["time_s"]) - self.latency}
+        given = dict(inputs) | ring_time | self.off | drives | self._sensors(inputs, time)
         operated = self.fault.operator != 0.0 and time < TAKEN_OVER
         outputs, memory = self.runner.run(given | ({"automatic": 0.0} if operated else {}), memory)
         if operated:
@@ -208,6 +200,19 @@ class Faulty:
             self.held = outputs
         return self.held, memory
 
+    def _sensors(self, inputs: Mapping[str, Any], time: float) -> dict[str, Any]:
+        """Faulty readings of pyrometer [K] and ring [mm] at a time [s]."""
+        T_1, ring = inputs["T_1_K"], inputs["ring_radius_mm"]
+        if self.fault.pyrometer and GONE[0] <= time < GONE[1]:
+            T_1 = self.fault.pyrometer(T_1, self.seen)
+        else:
+            self.seen = T_1
+        if self.fault.ring and STEP <= time < self.fault.ring_ends:
+            ring = self.fault.ring(ring, self.ring)
+        else:
+            self.ring = ring
+        return {"T_1_K": T_1 + self.fault.drift * time / HOUR, "ring_radius_mm": ring}
+
 
 class Row(NamedTuple):
     """A controller under a fault."""
@@ -216,7 +221,7 @@ class Row(NamedTuple):
     """Radius error from half an hour on, of the crystals that were not lost [mm]."""
     lost: int
     helpless: int
-    """Number of them that were lost while the drives stood still."""
+    """Number of crystals that were lost while the drives stood still."""
     alarms: Alarm
     limited: float
     """Share of the time in which a drive counts as limited [-]."""

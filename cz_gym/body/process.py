@@ -50,13 +50,13 @@ def check(parameters: Parameters, meniscus: MeniscusModel) -> Parameters:
 
 @jittable
 def derive(parameters: Any, factors: Any, m: Any) -> Any:
-    """The drawn puller at its own operating point."""
+    """Constants of the drawn puller at its own operating point."""
     return plant.derive_puller(randomised(parameters, factors), factors.lam, m.height, m.ring_offset)
 
 
 @jittable
 def begin(slot: Any, m: Any) -> Any:
-    """The operating point's state, the radius off by what was drawn."""
+    """State of the operating point, its radius off by the drawn deviation."""
     p = slot.puller
     slot.v_p_mean = p.v_0
     return State(p.r_0 + slot.episode.r_c_start, p.h_0, p.T_1_0, p.T_2_0, p.T_b_0)
@@ -64,13 +64,13 @@ def begin(slot: Any, m: Any) -> Any:
 
 @jittable
 def nominal(x: Any, slot: Any, interval: Any) -> Any:
-    """The operating point's inputs, as controllers are told."""
+    """Inputs of the operating point, as controllers are told."""
     return Inputs(slot.puller.v_0, slot.puller.Q_H_0 + slot.episode.told_power)
 
 
 @jittable
 def disturb(Q_d: Any, dT_i: Any, t: Any, e: Any) -> Any:
-    """The disturbance with what is left of the melt at t [s]."""
+    """Disturbance at t [s], with the share of the melt's heat capacity that is left."""
     return Disturbance(Q_d, dT_i, melt_left(t, e))
 
 

@@ -47,9 +47,9 @@ TOLERANCE = 0.5 * MM
 PULL_TOLERANCE = 0.03
 """Deviation of the mean pull speed that costs nothing, relative to v_0 [-]."""
 PULL_MEMORY = 30.0 * MINUTE
-"""Averaging time of that mean, which is exponential [s]."""
+"""Averaging time of the exponential mean of the pull speed [s]."""
 SCALES = Cost(TOLERANCE, PULL_TOLERANCE, 0.06 * MM_PER_MIN, 1.0 * KILO)
-"""The deviations [m, -, m/s, W] at which a term equals its weight; of the mean pull speed, those beyond its band."""
+"""Deviations [m, -, m/s, W] at which a term equals its weight; the mean pull speed's begins at the end of its band."""
 WEIGHTS = Weights()
 """The weights of the environment's reward."""
 COST_CAP = 10.0
@@ -92,7 +92,7 @@ def cost_terms(at: Any, weights: Any = WEIGHTS) -> Any:
 
 @jittable
 def cost_slopes(at: Any, weights: Any = WEIGHTS) -> Any:
-    """The derivative of each of :func:`cost_terms` by its own number."""
+    """Derivative of each of :func:`cost_terms` by its own number."""
     per_square = coefficients(weights)
     return Cost(
         2.0 * per_square.radius * at.radius,
@@ -165,7 +165,7 @@ class Measured(NamedTuple):
 
 @jittable
 def measure(x: Any, u: Any, nominal: Any, memory: Any, readings: Any, slot: Any, t: Any) -> Any:
-    """:class:`Measured` of a slot at its sample's time t [s]."""
+    """Readings and recipe of a slot at the time t of its sample [s]."""
     p, e, read = slot.puller, slot.episode, read_drives(u, slot)
     r_ref = reference(t, e)
     return Measured(
@@ -215,7 +215,7 @@ class TrueState(NamedTuple):
 
 @jittable
 def true_state(slot: Any, measured: Any, t: Any) -> Any:
-    """:class:`TrueState` of a slot at its sample's time t [s]."""
+    """True state and disturbances of a slot at the time t of its sample [s]."""
     p, x = slot.puller, slot.x
     return TrueState(
         r_c_error=x.r_c - p.r_0 - measured.r_ref,
@@ -268,7 +268,7 @@ class Logged(NamedTuple):
 
 @jittable
 def out_of_tolerance(slot: Any, measured: Any) -> Any:
-    """The constraint's cost of a step: 1 if the crystal leaves its quality, else 0."""
+    """Constraint's cost of a step: 1 if radius or mean pull speed is out of tolerance, else 0."""
     error = slot.x.r_c - slot.puller.r_0 - measured.r_ref
     return outside(error, slot.v_p_mean / slot.puller.v_0 - 1.0)
 

@@ -48,7 +48,7 @@ SUB = 4
 TOLERANCE = 12.0
 """Difference between a pixel's corners that counts as an edge [grey values]."""
 REFLECTIONS = 2
-"""The first makes the ring's outer part and edge, the second the part nearer to the crystal."""
+"""Largest number of reflections: the first makes the ring's outer part and edge, the second its inner part."""
 _APART = 1e-4
 """Distance in q of a mirrored ray's bracket from its start [-]."""
 _GOLDEN = 0.6180339887498949

@@ -88,7 +88,7 @@ def camera_for(parameters: Parameters, pose: CameraPose | None = None) -> Camera
 
 
 def camera_sight(camera: Camera) -> Sight:
-    """What decides where this camera sees a bright ring."""
+    """Lens, bare wall and pixel of a camera, which decide where it sees a bright ring."""
     pose = CameraPose(camera.tilt, camera.distance, camera.wall_height, camera.shield_radius)
     return sight_of(pose, camera.aim, camera.pixel_pitch / camera.focal_length)
 

@@ -255,7 +255,7 @@ class Interface(NamedTuple):
 
 @force_inlined
 def at_interface(x: Any, d: Any, p: Any, slope: Any) -> Any:
-    """:class:`Interface` of a state."""
+    """Growth, heat fluxes and meniscus at the interface of a state."""
     sin_theta, cos_theta = slope(x.r_c, x.h_c, p)
     M_men = meniscus_mass(x.r_c, x.h_c, cos_theta, p)
     deep = depth(x.M_s, M_men, p)
@@ -266,7 +266,7 @@ def at_interface(x: Any, d: Any, p: Any, slope: Any) -> Any:
 
 @force_inlined
 def rates(x: Any, u: Any, d: Any, p: Any, m: Any) -> Any:
-    """Time derivatives of the state; design equations of section 10."""
+    """Time derivatives of the state, in SI units (docs/crystal.md)."""
     at = at_interface(x, d, p, m.slope)
     heat = heating(x, u, p, wall(at.deep, p), at.Phi_l)
     M_s_dot = p.rho_s * math.pi * x.r_c * x.r_c * at.v_g

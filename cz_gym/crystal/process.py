@@ -58,7 +58,7 @@ class Sensed(NamedTuple):
     edge: Any
     """The camera's last reading of the crystal's edge [m]."""
     edge_error: Any
-    """Its error when it was last valid [m]."""
+    """Error of the edge's last valid reading [m]."""
     edge_valid: Any
     """1 if the camera reads the edge, else 0."""
     edge_bias: Any
@@ -282,9 +282,9 @@ class LinearRecipe(NamedTuple):
     C: Floats
     """The bright ring [m], the load cell [N] and the crystal's edge [m] by the states, shape (points, 3, 6)."""
     shows_ring: npt.NDArray[np.bool_]
-    """Whether the camera shows a ring there on the recipe."""
+    """True where the camera shows a ring on the recipe, shape (points,)."""
     load: float
-    """Heat load on the melt that comes with a kelvin of drift, which the recipe that is given follows [W/K]."""
+    """Heat load on the melt per kelvin of drift, which the given recipe follows [W/K]."""
 
     @property
     def a_h(self) -> Floats:

@@ -102,7 +102,7 @@ def growth_rate(L: Any, p: Any) -> Any:
 
 @jittable
 def in_cone(L: Any, p: Any) -> Any:
-    """Whether a length lies in crown or tail."""
+    """True if a length lies in crown or tail."""
     return (L.real < p.crown_length) | (L.real > p.crown_length + p.body_length)
 
 
@@ -146,7 +146,7 @@ class RecipeRow(NamedTuple):
     Phi_s: Any
     """Heat flux into the crystal [W/m2]."""
     needed: Any
-    """Heat that the melt must be given beside what heats it [W]; then the heat through the crucible's wall."""
+    """Heat to be given to the melt beyond the heating [W]; then the heat through the crucible's wall."""
 
 
 TABLE = (ROWS, len(RecipeRow._fields))
@@ -387,7 +387,7 @@ def height_inside(h_c: Any, p: Any) -> Any:
 
 @jittable
 def within_limits(x: Any, r_ref: Any, limit: Any, p: Any) -> Any:
-    """Whether the crystal still grows: meniscus, radius and superheat within their limits; false if one is NaN."""
+    """True while the crystal grows: meniscus, radius and superheat within their limits; false if one is NaN."""
     radius = (np.abs(x.r_c - r_ref) <= limit) & (x.r_c >= LEAST_RADIUS * p.r_start)
     meniscus = (x.h_c >= HEIGHT_MIN) & (x.h_c <= HEIGHT_MAX_IN_A * p.a)
     return radius & meniscus & (x.T_b >= p.T_m)

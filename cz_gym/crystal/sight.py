@@ -1,4 +1,4 @@
-"""What the camera sees of a whole crystal: where it shows a bright ring, and the crystal's edge where it shows none.
+"""View of the camera on a whole crystal: the bright ring where there is one, else the crystal's edge.
 
 The ring is the crucible's bare wall, mirrored by the meniscus. Its outer edge is where the meniscus halves the angle
 between the lens and the wall's upper end; a meniscus that is nowhere so steep mirrors the dark heat shield alone. No
@@ -28,7 +28,7 @@ class RingEdge(NamedTuple):
     """Outer edge of the mirrored wall."""
 
     slope: Any
-    """Slope of the meniscus that it needs [rad]."""
+    """Slope of the meniscus at the edge [rad]."""
     r: Any
     """Distance from the axis [m]."""
     z: Any
@@ -66,7 +66,7 @@ def ring_pixels(r_c: Any, h_c: Any, p: Any) -> Any:
 
 @jittable
 def shows_ring(r_c: Any, h_c: Any, p: Any) -> Any:
-    """Whether the camera shows a ring that can be read around a crystal [m]."""
+    """True if the camera shows a readable ring around a crystal [m]."""
     return ring_pixels(r_c, h_c, p) >= LEAST_PIXELS
 
 

@@ -97,7 +97,7 @@ class Measured(NamedTuple):
 
 @jittable
 def measure(x: Any, u: Any, nominal: Any, memory: Any, readings: Any, slot: Any, t: Any) -> Any:
-    """:class:`Measured` of a slot at its sample's time t [s]."""
+    """Readings and recipe of a slot at the time t of its sample [s]."""
     p, e, L, read = slot.puller, slot.episode, x.L, read_drives(u, slot)
     near, far = later(L, NEAR, p), later(L, FAR, p)
     now, shift = shape_at(L, p, e), drift(t, e) - p.T_1_0
@@ -160,7 +160,7 @@ class TrueState(NamedTuple):
 
 @jittable
 def true_state(slot: Any, measured: Any, t: Any) -> Any:
-    """:class:`TrueState` of a slot at its sample's time t [s]."""
+    """True state and disturbances of a slot at the time t of its sample [s]."""
     p, x, L = slot.puller, slot.x, slot.x.L
     return TrueState(
         r_c_error=x.r_c - p.r_0 - measured.r_ref,
@@ -229,20 +229,20 @@ class Logged(NamedTuple):
 
 @jittable
 def out_of_tolerance(slot: Any, measured: Any) -> Any:
-    """The constraint's cost of a step: 1 if the crystal leaves its quality, else 0."""
+    """Constraint's cost of a step: 1 if radius or mean pull speed is out of tolerance, else 0."""
     error = slot.x.r_c - slot.puller.r_0 - measured.r_ref
     return outside(error, slot.v_p_mean / slot.puller.v_0)
 
 
 @jittable
 def succeeded(slot: Any) -> Any:
-    """1 once the length was reached, else 0."""
+    """Success of an episode: 1 once its length was reached, else 0."""
     return 1.0 if slot.over == DONE else 0.0
 
 
 @jittable
 def part_at(L: Any, p: Any) -> Any:
-    """0 in the crown, 1 in the body, 2 in the tail."""
+    """Part of the crystal at a length: 0 in the crown, 1 in the body, 2 in the tail."""
     if p.crown_length > L:
         return 0.0
     return 1.0 if p.crown_length + p.body_length >= L else 2.0

@@ -112,7 +112,7 @@ class Model(NamedTuple):
     nominal: int
     """Place of the nominal inputs in the differentiable state."""
     nominals: int
-    """Number of the nominal inputs there: none where they do not move."""
+    """Number of nominal inputs in the differentiable state: none where they do not move."""
     ring: int
     """Place of the ring in the differentiable state; the reading follows."""
     smooth: int
@@ -130,7 +130,7 @@ class Model(NamedTuple):
     channels: int
     """Number of channels of "measured"."""
     shown_by: int
-    """Columns of their derivatives: state, inputs, the nominal ones, ``StepMemory``, readings."""
+    """Columns of the channels' derivatives: state, inputs, the nominal ones, ``StepMemory``, readings."""
 
 
 @cache

@@ -60,7 +60,7 @@ def drive(slot: Any, pull: Any, heat: Any, drives: Any, interval: Any, process: 
 
 @force_inlined
 def is_slow(e: Any) -> Any:
-    """Whether the heater has a lag or dead time."""
+    """True if the heater has a lag or dead time."""
     return e.heater_lag + e.heater_dead_time > 0.0
 
 

@@ -43,13 +43,13 @@ class Variation(Enum):
     """Condition under which a member of a scenario makes its episodes differ from each other."""
 
     NEVER = "never"
-    """Never: a constant, or a number that matters only beside another member."""
+    """Constant, or a number that matters only beside another member: never varies."""
     RANGE = "range"
-    """If the ends of its range differ: the value is drawn between them."""
+    """Range from which the value is drawn: varies if its ends differ."""
     NONZERO = "nonzero"
-    """If it is not zero: the size or the number of something random."""
+    """Size or number of something random: varies unless it is zero."""
     CHANCE = "chance"
-    """If it lies between 0 and 1: the probability that something happens."""
+    """Probability of an event: varies if it lies between 0 and 1."""
 
     def differs(self, value: Any) -> bool:
         """True if a member of this kind and value makes episodes differ."""
@@ -65,7 +65,7 @@ class Member(NamedTuple):
 
     draw: Variation
     quantity: Quantity
-    """Its unit, meaning and range; the default may lie outside of the range."""
+    """Unit, meaning and range of the number; the default may lie outside of the range."""
 
 
 def member(default: Any, draw: Variation, limits: tuple[str, float, float], meaning: str, later: bool = False) -> Any:
@@ -277,7 +277,7 @@ class Scenario:
 
     @property
     def shares(self) -> tuple[float, ...]:
-        """Its share of the episodes, 1."""
+        """Share of the episodes of the one scenario: 1."""
         return (1.0,)
 
     @property

@@ -33,7 +33,7 @@ class Metrics(NamedTuple):
     rmse_mm: Floats
     """Root mean square of r_c - r_ref [mm]."""
     rmse_survivors_mm: Floats
-    """The same of a crystal that is not lost; NaN if it is [mm]."""
+    """Root mean square of r_c - r_ref of a crystal that is not lost; NaN if it is [mm]."""
     rmse_observable_mm: Floats
     """Root mean square of r_c against r_ref minus the ring offset that no sensor shows [mm]."""
     max_error_mm: Floats
@@ -169,7 +169,7 @@ SHARED = (
     "rmse_mm", "rmse_survivors_mm", "rmse_observable_mm", "max_error_mm", "pull_step_rms_mm_per_min",
     "heater_step_rms_kw", "cost", "failure_rate", "return_",
 )  # fmt: skip
-"""Metrics of :class:`cz_gym.evaluation.metrics.Metrics` that mean the same here."""
+"""Metrics of a whole crystal with the meaning that they have in :class:`Metrics`."""
 KWH = KILO * HOUR
 """One kilowatt hour [J]."""
 
@@ -180,7 +180,7 @@ class CrystalMetrics(NamedTuple):
     rmse_mm: Floats
     """Root mean square of r_c - r_ref [mm]; after a loss it counts as the largest allowed one of the body."""
     rmse_survivors_mm: Floats
-    """The same of a crystal that is not lost; NaN if it is [mm]."""
+    """Root mean square of r_c - r_ref of a crystal that is not lost; NaN if it is [mm]."""
     rmse_observable_mm: Floats
     """Root mean square of r_c against r_ref minus the ring offset that no sensor shows [mm]."""
     max_error_mm: Floats
@@ -196,7 +196,7 @@ class CrystalMetrics(NamedTuple):
     v_over_G_within_3pct: Floats
     """Share of the body's length in which the 30 min mean of v/G is within 3 % of the recipe's [-]."""
     v_over_G_within_10pct: Floats
-    """The same within 10 % [-]."""
+    """Share of the body's length in which the 30 min mean of v/G is within 10 % of the recipe's [-]."""
     hours: Floats
     """Time grown [h]."""
     kwh_per_kg: Floats
@@ -214,17 +214,17 @@ class CrystalMetrics(NamedTuple):
     lost_in_crown: Floats
     """1 if the crystal was lost in the crown, else 0 [-]."""
     lost_in_body: Floats
-    """The same of the body [-]."""
+    """1 if the crystal was lost in the body, else 0 [-]."""
     lost_in_tail: Floats
-    """The same of the tail [-]."""
+    """1 if the crystal was lost in the tail, else 0 [-]."""
     frozen: Floats
     """1 if the crystal was lost because its meniscus was too low, else 0 [-]."""
     detached: Floats
-    """The same of a meniscus that was too high [-]."""
+    """1 if the crystal was lost because its meniscus was too high, else 0 [-]."""
     off: Floats
-    """The same of a radius error that was too large [-]."""
+    """1 if the crystal was lost because its radius error was too large, else 0 [-]."""
     cold: Floats
-    """The same of a melt below its melting point [-]."""
+    """1 if the crystal was lost because its melt was below the melting point, else 0 [-]."""
     failure_rate: Floats
     """1 if the crystal was lost, else 0 [-]."""
     return_: Floats

@@ -103,7 +103,7 @@ STYLES = {
     "lqg-quiet": _style(7, "sun"),
     "lqg-at-0.02-adaptive": _style(0, "cross"),
 }
-"""Looks of those that figures show, of ``Cz-v0`` and of whole crystals; :func:`styles` has the others'."""
+"""Looks of the controllers in the project's figures; :func:`styles` has those of others."""
 
 
 def styles(names: Sequence[str], learned: Sequence[str] = ()) -> dict[str, Style]:

@@ -252,7 +252,7 @@ CASES: tuple[Case, ...] = (
 )
 """Every case, in the order of tables; families of disturbances alone and variants of randomized run when asked for."""
 RANDOM_CASES = tuple(case for case in CASES if case.default and not case.deterministic)
-"""Those of several crystals that run unasked."""
+"""Cases of several crystals that run unasked."""
 
 _GROWN = {
     "crown": "from the neck to 60 mm of body",
@@ -334,7 +334,7 @@ class Maker:
 
     place: str
     source: Any
-    """The object there."""
+    """Controller at the place, or a class or function that makes one."""
 
     @classmethod
     def of(cls, place: str) -> Self:

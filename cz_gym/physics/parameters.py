@@ -35,7 +35,7 @@ class Quantity(NamedTuple):
     """A number that a user may state."""
 
     shown: str
-    """The unit in which files and pages show it, one of :data:`SIZES`."""
+    """Unit in which files and pages show the quantity, one of :data:`SIZES`."""
     meaning: str
     source: str = ""
     low: float | None = None
@@ -43,31 +43,31 @@ class Quantity(NamedTuple):
     high: float = math.inf
     """Largest plausible value [shown unit]."""
     stem: str = ""
-    """Its key in a file without the unit, where that is not the symbol."""
+    """Key of the quantity in a file without the unit, where that is not the symbol."""
     usual: tuple[float, float] = (-math.inf, math.inf)
-    """Range outside of which it is possible but improbable [shown unit]."""
+    """Range outside of which a value is possible but improbable [shown unit]."""
     drawn: bool = False
-    """True if each crystal may draw its own from a range."""
+    """True if each crystal may draw its own value from a range."""
     later: bool = False
-    """True if it was added after hashes were published: they leave it out at its default."""
+    """True if hashes were published before the quantity was added: they leave it out at its default."""
     table: str = ""
-    """Its table in a puller file; empty if it has none."""
+    """Table of a puller file that the quantity stands in; empty if there is none."""
     symbol: str = ""
-    """Its name in code."""
+    """Name of the quantity in code."""
 
     @property
     def unit(self) -> str:
-        """Its SI unit."""
+        """SI unit of the quantity."""
         return _SI[self.shown]
 
     @property
     def size(self) -> float:
-        """The shown unit in SI units."""
+        """Size of the shown unit in SI units."""
         return SIZES[self.unit].get(self.shown, 1.0)
 
     @property
     def key(self) -> str:
-        """Its key in a puller file: the stem, then the unit."""
+        """Key of the quantity in a puller file: the stem, then the unit."""
         over, *under = self.shown.split("/")
         ending = _IN_KEYS.get(self.shown, f"{over}_per_{''.join(under)}" if under else over)
         return f"{self.stem or self.symbol}_{ending}".removesuffix("_")
@@ -290,7 +290,7 @@ def pose_for(q: Parameters) -> CameraPose:
 
 
 class Sight(NamedTuple):
-    """What decides where a camera sees a bright ring: lens, bare wall and pixel."""
+    """Lens, bare wall and pixel of a camera, which decide where it sees a bright ring."""
 
     lens_x: float
     """Distance of the lens from the axis [m]."""

@@ -235,7 +235,7 @@ def fourth_power(T: Any) -> Any:
 
 @force_inlined
 def rates(x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
-    """Time derivatives of the state [m/s, m/s, K/s, K/s, K/s]; design equations of section 2."""
+    """Time derivatives of the state [m/s, m/s, K/s, K/s, K/s] (docs/physics.md)."""
     at_interface = growth(x, d, p, slope)
     heat = heating(x, u, p, p.G_2b, at_interface.Phi_l)
     return State(
@@ -249,7 +249,7 @@ def rates(x: Any, u: Any, d: Any, p: Any, slope: Any) -> Any:
 
 @force_inlined
 def heating(x: Any, u: Any, p: Any, G_2b: Any, Phi_l: Any) -> Any:
-    """:class:`Heating` through a wall of this conductance [W/K], with this flux into the interface [W/m2]."""
+    """Rates of heater and crucible, and the melt's heat, at this wall [W/K] and flux into the interface [W/m2]."""
     radiated = p.kappa_12 * (fourth_power(x.T_1) - fourth_power(x.T_2))
     into_melt = G_2b * (x.T_2 - x.T_b)
     covered = math.pi * x.r_c * x.r_c
@@ -308,7 +308,7 @@ def radius_limit(r_0: Any) -> Any:
 
 @jittable
 def within_limits(r_c: Any, h_c: Any, r_ref: Any, a: Any, radius_limit: Any = RADIUS_LIMIT) -> Any:
-    """Whether the crystal still grows; false if the meniscus freezes or detaches, the radius is lost, or one is NaN."""
+    """True while the crystal grows; false if the meniscus freezes or detaches, the radius is lost, or one is NaN."""
     return (np.abs(r_c - r_ref) <= radius_limit) & (h_c >= HEIGHT_MIN) & (h_c <= HEIGHT_MAX_IN_A * a)
 
 
@@ -346,7 +346,7 @@ def drift(t: Any, e: Any) -> Any:
 
 @jittable
 def recipe(t: Any, e: Any) -> Any:
-    """T_1,ref(t) - T_1,0 = e(t) + p(t) [K]: the recipe: its error plus the drift."""
+    """Recipe T_1,ref(t) - T_1,0 = e(t) + p(t) [K]: its error plus the drift."""
     return e.recipe_amount * progress(t, e.recipe_start, e.recipe_duration) + drift(t, e)
 
 

@@ -142,7 +142,7 @@ class PullerFile:
     name: str = "default"
     parameters: Parameters = field(default_factory=Parameters)
     recipe: CrystalRecipe = CrystalRecipe()  # noqa: RUF009  (immutable)
-    """The whole crystal that it grows."""
+    """Whole crystal that the machine grows."""
     heater_range: float = HEATER_SCALE
     heater_max: float | None = None
     heater_slew: float | None = None
@@ -173,7 +173,7 @@ class PullerFile:
     tau_fast: float | None = None
     tau_slow: float | None = None
     missing: tuple[str, ...] = field(default=(), compare=False, repr=False)
-    """Keys that its file does not have: they keep the default's value."""
+    """Keys that the file lacks: they keep the default puller's values."""
     file: Path | None = field(default=None, compare=False, repr=False)
     """The file that it was read from; what is designed for it stands beside."""
 

@@ -28,12 +28,12 @@ INK: Colour = (236, 239, 244)
 FAINT: Colour = (150, 160, 176)
 
 TRUE: Colour = (86, 180, 233)
-"""The true crystal."""
+"""Colour of the true crystal."""
 CAMERA: Colour = (240, 228, 66)
-"""The bright ring, and the radius that the camera reads from it."""
+"""Colour of the bright ring, and of the radius that the camera reads from it."""
 REFERENCE: Colour = (255, 255, 255)
 DRIVE: Colour = (204, 121, 167)
-"""Pull speed and heater."""
+"""Colour of pull speed and heater."""
 TEMPERATURE: Colour = (230, 159, 0)
 WELL: Colour = (0, 190, 140)
 ALARM: Colour = (213, 94, 0)
@@ -41,7 +41,7 @@ ALARM: Colour = (213, 94, 0)
 GAS: Colour = (15, 19, 27)
 MELT: Colour = (242, 138, 66)
 ON_MELT: Colour = (60, 20, 0)
-"""Words on the bright melt."""
+"""Colour of words on the bright melt."""
 CRYSTAL: Colour = (104, 112, 128)
 
 Frame = npt.NDArray[np.uint8]
@@ -56,7 +56,7 @@ FAR = 20_000.0
 
 
 def available() -> bool:
-    """Whether pygame can be found."""
+    """True if pygame can be found."""
     return importlib.util.find_spec("pygame") is not None
 
 

@@ -38,7 +38,7 @@ SMALLEST, LARGEST = 360, 3840
 
 
 class Ending(Enum):
-    """How an episode ended, in words for a picture."""
+    """Ending of an episode, in words for a picture."""
 
     FROZEN = "FROZEN: meniscus too low"
     DETACHED = "DETACHED: meniscus too high"
@@ -56,7 +56,7 @@ class Record:
         self.puller = config.process.Constants(*slot["puller"].tolist())
         self.episode = Episode(*slot["episode"].tolist())
         self.ending: Ending | None = None
-        """How the episode ended; None while it goes on."""
+        """Ending of the episode; None while it goes on."""
         self._first = int(slot["k"])
         self._column = {name: column for column, name in enumerate((*config.process.info, "valid"))}
         self._samples, self._count = np.zeros((config.steps + 1, len(self._column))), 0
@@ -231,7 +231,7 @@ WIDER, LEAST_WIDTH, DEEP = 1.45, 14.0 * MM, 0.2
 """Width of a whole crystal's panel in largest radii [-], the least radius that counts [m], and the melt's share of the
 panel's height [-]."""
 BELOW, ABOVE = 9.0 * MM, 24.0 * MM
-"""Heights that it shows below the melt's surface, and above it at least [m]."""
+"""Heights that the panel shows below the melt's surface, and above it at least [m]."""
 POINTS = 48
 """Points of a drawn meniscus."""
 LOWEST = 1e-3

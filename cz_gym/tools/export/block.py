@@ -362,7 +362,7 @@ class Ring(NamedTuple):
     error: Any
     """Distance of the ring from the reference, without the ring's steps [m]."""
     stepped: Any
-    """True if it has jumped by more than a crystal can."""
+    """True if the ring has jumped by more than a crystal can."""
     last: Any
     """:attr:`Memory.last_ring` [m]."""
     still_time: Any

@@ -85,8 +85,8 @@ class Controller(Protocol):
 
     @property
     def observes(self) -> bool:
-        """True if its memory follows the crystal also while another controller or a hold sets the drives, as that of a
-        filter or of a trained agent does. Else it begins anew when the fallback gives way."""
+        """True if the controller's memory follows the crystal also while another controller or a hold sets the drives,
+        as that of a filter or of a trained agent does. Else it begins anew when the fallback gives way."""
 
     def at_rest(self, seen: Measured) -> Any:
         """The controller's memory before the first sample."""

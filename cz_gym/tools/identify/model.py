@@ -57,7 +57,7 @@ class Lags(NamedTuple):
     heater_lag: Any = 0.0
     """Time constant with which the power that heats follows the log's [s]."""
     heater_dead_time: Any = 0.0
-    """Time before it begins to follow [s]; negative where the log's row holds the power that comes after it."""
+    """Dead time of the power that heats [s]; negative where the log's row holds the power that comes after it."""
     pyrometer_filter: Any = 0.0
     """Time constant of the pyrometer's filter [s]."""
 

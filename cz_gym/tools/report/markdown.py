@@ -38,7 +38,7 @@ BESIDE = (
 )
 """Columns beside the scrap."""
 SHORT = 5
-"""Number of them on a terminal."""
+"""Number of :data:`BESIDE` on a terminal."""
 EXPLAINED = (
     "Scrap is the share of the time in which the diameter is outside the tolerance band (--tolerance); a lost crystal "
     "is scrap to the end. v/G stays within 3 % where the 30 min mean of the pull speed does."
@@ -157,7 +157,7 @@ def brief(benchmark: Benchmark) -> str:
 
 
 def finding(benchmark: Benchmark) -> str:
-    """Say who is best of those not told the scenario, of each kind, who of those told, and how much they move.
+    """Name the best controllers that are not told the scenario, by kind, the best told ones, and how much each moves.
 
     Empty where one of the three is missing, for a puller or of whole crystals, and for a few crystals.
     """

@@ -4,7 +4,7 @@ They are SVG, with text that can be searched and colours that follow the reader'
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from html import escape
 from typing import NamedTuple
 
@@ -146,7 +146,6 @@ def result(benchmark: Benchmark) -> str:
     reached = [value for found in there for value in (found.mean, *found.ends)]
     room = (WIDTH - LABELS - 12.0) / len(cases)
     bottom = TOP + ROW * len(shown)
-    crystals = max((found.n for found in there), default=0)
     parts = [text(12.0, 26.0, "Error of the radius, RMSE [mm]: further left is better", font_weight="bold")]
     for number, case in enumerate(cases):
         left = LABELS + number * room
@@ -161,14 +160,20 @@ def result(benchmark: Benchmark) -> str:
     for row, each in enumerate(shown):
         name = PLAIN.get(each.name, each.name)
         parts += [text(LABELS - 4.0, TOP + (row + 0.5) * ROW + 5.5, short(name), "end")]
+    below, height = _below(shown, cases[0], max((found.n for found in there), default=0), bottom)
+    return svg(height, parts + below, "Radius error of each controller: " + _spoken(known))
+
+
+def _below(shown: Sequence[Contender], case: Case, crystals: int, y: float) -> tuple[list[str], float]:
+    """Key and notes below the rows, which end at y [px], and the height of the picture [px]."""
     told = "which scenario it meets" if any(each.told for each in shown) else "what no sensor shows"
-    hollow = any(is_told(each, cases[0]) for each in shown)
+    hollow = any(is_told(each, case) for each in shown)
     notes = ["mean of all crystals, lost ones included"]
     notes += [f"bars: 95 % intervals over {crystals} test crystals"] if crystals > 1 else []
-    top = bottom + 84.0 + 28.0 * hollow
-    parts += _key(bottom + 52.0, f"hollow: told {told}" if hollow else "", any(each.learned for each in shown))
+    top = y + 84.0 + 28.0 * hollow
+    parts = _key(y + 52.0, f"hollow: told {told}" if hollow else "", any(each.learned for each in shown))
     parts += [text(12.0, top + 26.0 * row, note, class_="faint") for row, note in enumerate(notes)]
-    return svg(top - 10.0 + 26.0 * len(notes), parts, "Radius error of each controller: " + _spoken(known))
+    return parts, top - 10.0 + 26.0 * len(notes)
 
 
 def _spoken(known: dict[tuple[str, str], Estimate | None]) -> str:

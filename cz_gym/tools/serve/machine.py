@@ -230,7 +230,7 @@ class Machine:
         self._log, self._state, self._lock = log, state, threading.RLock()
         own, told = self._record.puller, self._record.episode
         self.puller = own._replace(Q_H_0=own.Q_H_0 + told.told_power, T_1_0=own.T_1_0 + told.told_temperature)
-        """Its constants, with the nominal values that controllers are told."""
+        """Constants of the puller, with the nominal values that controllers are told."""
         self._fallback = self._make_fallback()
         self._memory = self._rest()
         self._fixed = self._settings()
