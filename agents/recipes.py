@@ -370,10 +370,14 @@ def validate(policy: Any, config: Config, seeds: Sequence[int]) -> Validation:
     return Validation(*(float(figure.mean()) for figure in figures))
 
 
-def references(make_controller: Callable[[str, Config], Any], recipe: TrainingConfig) -> References:
+def references(
+    make_controller: Callable[[str, Config], Any],
+    recipe: TrainingConfig,
+    progress: Callable[[int], Any] = lambda crystals: None,
+) -> References:
     """RMSEs of classical controllers on a recipe's crystals, each designed for a crystal's own scenario.
 
-    ``make_controller`` makes a controller by its name.
+    ``make_controller`` makes a controller by its name; ``progress`` is called with the number of crystals done.
     """
     config = replace(recipe.config, observation="measured", action="direct")
 
@@ -385,6 +389,7 @@ def references(make_controller: Callable[[str, Config], Any], recipe: TrainingCo
             if own := [seed for seed, each in zip(seeds, drawn, strict=True) if each == scenario.name]:
                 alone = config.with_scenario(scenario)
                 total += len(own) * validate(make_controller(name, alone), alone, own).rmse_mm
+                progress(len(own))
         return total / len(seeds)
 
     names = REFERENCES[config.process.name]

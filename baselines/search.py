@@ -7,7 +7,7 @@ stopped again, measures none of them again, and continues.
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
@@ -76,6 +76,8 @@ class Search:
         self.budget, self.trials = {"trials": trials, "episodes": episodes}, list[Trial]()
         self.path: Path | None = None
         """File of the trials; None for none."""
+        self.progress: Callable[[int], Any] = lambda candidates: None
+        """Called with the number of candidates done, finalists counted once more."""
         self._paths = [parameter.path for parameter in objective.parameters]
 
     @property
@@ -124,6 +126,7 @@ class Search:
         trial = self._scored(values, TRAINING_SEEDS[:episodes], 0 if self.quick else episodes // 5, best)
         self.trials.append(trial)
         self._write({})
+        self.progress(len(self.trials))
         return trial
 
     def _scored(self, values: tuple[float, ...], seeds: Sequence[int], survive: int, below: float = math.inf) -> Trial:
@@ -152,7 +155,10 @@ class Search:
             self._read(path)
         self.explore()
         twice = 2 * self.budget["episodes"]
-        finalists = [self._scored(trial.values, VALIDATION_SEEDS[:twice], twice) for trial in self.best(FINALISTS)]
+        finalists = []
+        for trial in self.best(FINALISTS):
+            finalists.append(self._scored(trial.values, VALIDATION_SEEDS[:twice], twice))
+            self.progress(len(self.trials) + len(finalists))
         judged = sorted(finalists, key=lambda trial: trial.score)
         entries = [
             {"score": trial.score, "values": dict(zip(self._paths, trial.values, strict=True)), **trial.facts}

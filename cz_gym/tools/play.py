@@ -22,7 +22,7 @@ from cz_gym.evaluation.protocol import scenarios
 from cz_gym.evaluation.rollout import Playback, rollout
 from cz_gym.puller.file import chosen_puller
 from cz_gym.rendering.canvas import load
-from cz_gym.support.command_line import OneLineParser, between
+from cz_gym.support.command_line import OneLineParser, between, filled
 from cz_gym.support.errors import CzError
 from cz_gym.support.units import MINUTE
 
@@ -134,4 +134,4 @@ def _play(arguments: argparse.Namespace) -> None:
     keys, still = keys_to_actions(), np.zeros(2, np.float32)
     play(env, fps=fps, callback=watch, keys_to_action=keys, seed=arguments.seed, noop=still)
     if actions:
-        print(score(config, arguments.seed, actions, failed))
+        print(filled(score(config, arguments.seed, actions, failed)))

@@ -119,7 +119,7 @@ def train(arguments: argparse.Namespace) -> int:
         print(f"{_summary_line(summary)}\nwrote {arguments.out / 'agent.onnx'}")
         return 0
     layout = "{percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
-    with tqdm(total=len(runs), bar_format=layout, disable=None) as bar:
+    with tqdm(total=len(runs), bar_format=layout, dynamic_ncols=True, disable=None) as bar:
         for run, summary in train_seeds(runs, bar, arguments.cluster):
             bar.write(f"seed {run.seed}: {_summary_line(summary)}")
     print(f"wrote agent.onnx into {len(runs)} folders of {arguments.out}")
@@ -137,10 +137,15 @@ def _base_of(recipe: TrainingConfig) -> Base | None:
 
 def _measure_references(recipe: TrainingConfig) -> Any:
     """Measure the classical controllers that the agent is shown beside, and say so before and after."""
-    from cz_gym.agents.recipes import REFERENCES, references
+    from tqdm import tqdm
 
-    print(f"measuring {', '.join(REFERENCES[recipe.config.process.name])} on the validation crystals", flush=True)
-    found = references(make_controller, recipe)
+    from cz_gym.agents.recipes import JUDGING_SEEDS, REFERENCES, SELECTION_SEEDS, references
+
+    names = REFERENCES[recipe.config.process.name]
+    print(f"measuring {', '.join(names)} on the validation crystals", flush=True)
+    crystals = len(names) * (len(SELECTION_SEEDS) + len(JUDGING_SEEDS))
+    with tqdm(total=crystals, unit="crystal", leave=False, dynamic_ncols=True, disable=None) as bar:
+        found = references(make_controller, recipe, bar.update)
     print(", ".join(f"{name} {rmse:.3f}" for name, (rmse, _) in found.items()), "mm; making the learner", flush=True)
     return found
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cz_gym.baselines.margins import MarginLimits, margin_limits
-from cz_gym.baselines.search import Search, Trial
+from cz_gym.baselines.search import FINALISTS, Search, Trial
 from cz_gym.baselines.tuned import OWN_PULLER, TunedController, file_name, folder_of
 from cz_gym.baselines.tuned_controllers import CRYSTALS, LQGS, PIDS
 from cz_gym.body.process import BODY
@@ -54,6 +54,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _tune(given: argparse.Namespace) -> None:
+    from tqdm import tqdm
+
     if given.puller is not None:
         if given.scenario or given.control_interval:
             raise CzError("a search for a --puller has scenarios and interval of its own: leave both options out")
@@ -73,8 +75,10 @@ def _tune(given: argparse.Namespace) -> None:
     margins = asked_margins(given, tuned, tuned.margins)
     budget = given.trials or 100, given.episodes or 100
     search = Search(tuned.name, tuned.objective(scenario), config, *budget, margins=margins)
-    path = (given.out or Path("runs/tuning")) / file_name(tuned.name, scenario.name)
-    chosen = search.tune(path)
+    path, candidates = (given.out or Path("runs/tuning")) / file_name(tuned.name, scenario.name), budget[0] + FINALISTS
+    with tqdm(total=candidates, unit="candidate", leave=False, dynamic_ncols=True, disable=None) as bar:
+        search.progress = lambda done: bar.update(done - bar.n)
+        chosen = search.tune(path)
     print(f"{tuned.name} on {scenario.name}: score {chosen.score:.4f} on validation crystals")
     for parameter, value in zip(search.objective.parameters, chosen.values, strict=True):
         print(f"  {parameter.path} = {value:.6g}")

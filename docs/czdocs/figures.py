@@ -29,7 +29,7 @@ SETTINGS = {"svg.hashsalt": "cz", "font.size": 9, "image.composite_image": False
 
 def furnace() -> Figure:
     """A puller in cross-section, and its meniscus to scale."""
-    figure = canvas(8.0, 4.3)
+    figure = canvas(8.0, 3.4)
     left, right = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
     _chamber(left)
     _meniscus(right)

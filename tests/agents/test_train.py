@@ -105,7 +105,7 @@ def references_once(make, config):
 
 @pytest.fixture
 def quick(monkeypatch, few_crystals):
-    monkeypatch.setattr(recipes, "references", lambda make, recipe: references_once(make, recipe.config))
+    monkeypatch.setattr(recipes, "references", lambda make, recipe, _: references_once(make, recipe.config))
     monkeypatch.setitem(RECIPES, "ppo", QUICK)
     monkeypatch.setitem(CRYSTAL_RECIPES, "ppo", replace(QUICK, name="ppo-along", **ALONG))
     for known in (RECIPES, CRYSTAL_RECIPES):
@@ -434,6 +434,8 @@ def test_a_reference_has_its_design_for_each_crystal(scenario, monkeypatch):
         own = config.with_scenario(name)
         errors.append(metrics(rollout(make_controller("paper-tuned", own), own, [seed])).rmse_mm[0])
         drawn.add(name)
-    found = recipes.references(make_controller, recipe)
+    told: list[int] = []
+    found = recipes.references(make_controller, recipe, told.append)
+    assert sum(told) == len(SEEDS) + 1
     assert found == {"paper-tuned": pytest.approx((np.mean(errors), errors[0]), rel=1e-12)}
     assert len(drawn) == (1 if scenario == "randomized" else 3)

@@ -56,8 +56,10 @@ def bowl(trials=40, episodes=4, parameters=TWO):
 
 def test_validation_chooses_among_the_best_of_training(tmp_path):
     path = tmp_path / "new" / "bowl.json"
-    search, _ = bowl()
+    (search, _), done = bowl(), []
+    search.progress = done.append
     chosen = search.tune(path)
+    assert done == [*range(1, len(search.trials) + 4)]
     assert search.trials[0].values == (FilteredPID().T_f, FilteredPID().K_ff)
     assert search.best(1)[0].score < 1e-3
     assert chosen.values[0] == max(trial.values[0] for trial in search.best(3))

@@ -168,6 +168,8 @@ def test_the_heading_the_plot_and_the_verdict_come_first_and_names_are_text(repo
     assert report.find_elements("css selector", "img, svg a") == []
     offered = [each.get_attribute("textContent") for each in report.find_elements("css selector", "#left-name option")]
     assert EVIL in offered
+    scale = report.find_elements("css selector", '#left-side .panel text[x="54"]')
+    assert "0" in [each.get_attribute("textContent") for each in scale], "a scale without its zero"
 
 
 @pytest.mark.parametrize("width", [1280, 400])

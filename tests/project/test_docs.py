@@ -19,6 +19,7 @@ import nbformat
 import pytest
 import sybil
 from markdown_it import MarkdownIt
+from nbclient import NotebookClient
 from sybil.parsers.markdown import CodeBlockParser
 
 import cz_gym_command
@@ -27,6 +28,7 @@ from cz_gym.physics.parameters import describe
 from tests.conftest import ROOT, python
 
 DOCS = ROOT / "docs"
+NOTEBOOKS = runpy.run_path(str(DOCS / "notebooks.py"))
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "results" / "README.md", *sorted(DOCS.rglob("*.md"))]
 SLOW = {"docs/paper.md", "docs/extend/meniscus.md", "docs/your-puller.md", "docs/learn/libraries.md"}
 SMALL = {
@@ -42,7 +44,7 @@ SMALL = {
     "learn(9_000_000)": "learn(8192)",
     "seeds=range(20)": "seeds=range(2)",
     "seeds=range(10)": "seeds=range(2)",
-    "--scenarios randomized --out mine": "--scenarios reference-b --episodes 1 --quiet --out mine",
+    "--scenario randomized --out mine": "--scenario reference-b --episodes 1 --quiet --out mine",
 }
 """Replacements that make a block small enough for a test: the same on fewer crystals."""
 HEADINGS = (
@@ -255,8 +257,7 @@ def test_every_symbol_has_unit_meaning_and_a_numbered_equation(monkeypatch):
 
 def test_the_example_pages_become_notebooks(tmp_path):
     """Their cells are the pages' blocks, which run above, after one that installs the package where Colab runs it."""
-    made = runpy.run_path(str(DOCS / "notebooks.py"))
-    for page, file in zip(made["PAGES"], made["write"](tmp_path), strict=True):
+    for page, file in zip(NOTEBOOKS["PAGES"], NOTEBOOKS["write"](tmp_path), strict=True):
         notebook = nbformat.read(file, as_version=4)
         nbformat.validate(notebook)
         first, *code = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
@@ -266,3 +267,14 @@ def test_the_example_pages_become_notebooks(tmp_path):
         text = "".join(cell.source for cell in notebook.cells if cell.cell_type == "markdown")
         for link in re.findall(r"\]\(([^)#:]+)[)#]", text):
             assert (tmp_path / link).exists(), link
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", NOTEBOOKS["PAGES"])
+def test_a_notebook_runs_as_one(page, tmp_path, monkeypatch):
+    """In a kernel of its own, as Colab runs it, at the size of the page's test; commands are text there."""
+    monkeypatch.setenv("IPYTHONDIR", str(tmp_path))
+    file = NOTEBOOKS["write"](tmp_path)[NOTEBOOKS["PAGES"].index(page)]
+    notebook = nbformat.reads(small(file.read_text()), as_version=4)
+    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    assert all(cell.execution_count for cell in notebook.cells if cell.cell_type == "code")

@@ -60,7 +60,9 @@ def test_a_run_ends_with_the_score(leaves, monkeypatch, capsys):
     assert len(shown) == steps + 1
     assert min(shown) > 200
     config = make_config("randomized", None, "measured", horizon=300.0, action="rate")
-    assert capsys.readouterr().out == play.score(config, 3, [np.zeros(2, np.float32)] * steps, False) + "\n"
+    told = capsys.readouterr().out
+    assert told.replace("\n", " ") == play.score(config, 3, [np.zeros(2, np.float32)] * steps, False) + " "
+    assert max(map(len, told.splitlines())) <= 80
 
 
 def test_the_score_of_the_same_controller_is_a_draw():

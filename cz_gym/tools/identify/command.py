@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -323,12 +324,16 @@ def _check_outputs(given: argparse.Namespace, start: PullerFile) -> None:
 
 
 def _main(given: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
     start = find_puller(given.puller)
     _check_outputs(given, start)
     logs = [read_given(path, given) for path in given.log]
     for path, log in zip(given.log, logs, strict=True):
         check_puller(log, start, str(path))
-    identified = identify(logs, start, dict(map(_prior, given.prior)))
+    shown: Any = {"bar_format": "fitting: {n_fmt} steps in {elapsed}", "leave": False, "disable": None}
+    with tqdm(**shown) as bar:
+        identified = identify(logs, start, dict(map(_prior, given.prior)), progress=bar.update)
     page, files = given.out.with_suffix(".md"), dict[Path, bytes]()
     names = ", ".join(path.name for path in given.log)
     if given.force or not identified.misfits:

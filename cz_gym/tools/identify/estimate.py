@@ -188,12 +188,13 @@ def identify(
     start: PullerFile = DEFAULT,
     prior_sd: Mapping[str, float] | None = None,
     meniscus: MeniscusModel = HURLE,
+    progress: Callable[[], Any] = lambda: None,
 ) -> Identified:
     """Estimate what one or several logs tell of a puller; parameters of a path that is not excited are left alone.
 
     ``start`` holds the prior's medians, ``prior_sd`` standard deviations of logarithms other than those of
-    :func:`prior_sds`. Drives that seem to act before they do are moved by a row: the log's row then holds what came
-    after its readings.
+    :func:`prior_sds`; ``progress`` is called at each step of the search. Drives that seem to act before they do are
+    moved by a row: the log's row then holds what came after its readings.
     """
     logs = (log,) if isinstance(log, Log) else tuple(log)
     sds = prior_sds(prior_sd or {})
@@ -201,10 +202,10 @@ def identify(
     free = (*((*HEATER, *LAGS) if heater >= 1.0 else ()), *(PULL if pull >= 1.0 else ()))
     model = Model((*free, *NoiseLevels._fields), start.parameters, meniscus, _lags_of(start, heater >= 1.0))
     sd, latency = np.array([sds[name] for name in model.names]), start.latency or 0.0
-    rows, best = _fit(logs, latency, model, sd)
+    rows, best = _fit(logs, latency, model, sd, progress)
     if "heater_lag" in free and (total := _delay(best, model))[0] + 2.0 * total[1] < 0.0:
         logs = tuple(map(shift_drives, logs))
-        rows, best = _fit(logs, latency, model, sd)
+        rows, best = _fit(logs, latency, model, sd, progress)
 
     whole = join_logs(rows)
     read = np.isfinite([whole.T_1, whole.ring]).T
@@ -279,10 +280,12 @@ def _delay(best: Maximum, model: Model) -> Floats:
     return np.array([sum(lags), np.sqrt(slope @ best.covariance @ slope)])
 
 
-def _fit(logs: Sequence[Log], latency: float, model: Model, sd: Floats) -> tuple[list[Log], Maximum]:
+def _fit(
+    logs: Sequence[Log], latency: float, model: Model, sd: Floats, progress: Callable[[], Any]
+) -> tuple[list[Log], Maximum]:
     """The logs on the rows of estimation, for a camera's latency [s], and the posterior's maximum on them."""
     rows = [prepare(each, latency) for each in logs]
-    return rows, _maximise(rows, model, sd)
+    return rows, _maximise(rows, model, sd, progress)
 
 
 def _estimate(name: str, best: Maximum, model: Model, sd: Floats, interval: float) -> Estimate:
@@ -297,7 +300,7 @@ def _estimate(name: str, best: Maximum, model: Model, sd: Floats, interval: floa
     return Estimate(name, usual, value, low, high, deviation / sd[j], trusted=bool(delay))
 
 
-def _maximise(logs: Sequence[Log], model: Model, sd: Floats) -> Maximum:
+def _maximise(logs: Sequence[Log], model: Model, sd: Floats, progress: Callable[[], Any]) -> Maximum:
     """Search the posterior's maximum; the start of the search if the filter cannot follow the log there.
 
     The curvature is Fisher's information of Gaussian prediction errors, so no second derivatives are needed.
@@ -306,6 +309,7 @@ def _maximise(logs: Sequence[Log], model: Model, sd: Floats) -> Maximum:
     @lru_cache(maxsize=2)
     def posterior(packed: bytes) -> tuple[float, Floats, Floats, Predicted]:
         away = np.frombuffer(packed)
+        progress()
         value, slope, information, out = _likelihood(logs, model, model.mean + away * sd)
         if not np.isfinite(value):
             return np.inf, np.zeros(len(away)), np.eye(len(away)), out

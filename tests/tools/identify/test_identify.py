@@ -126,8 +126,10 @@ def test_controllers_alone_excite_nothing_whatever_their_law(name, tmp_path):
 
 @pytest.mark.slow
 def test_the_information_of_two_logs_adds_up(logs, found):
-    both = identify([read_log(logs[0])] * 2)
+    steps: list[int] = []
+    both = identify([read_log(logs[0])] * 2, progress=lambda: steps.append(1))
     assert not both.misfits
+    assert len(steps) > 1
     assert both.excitation == pytest.approx(np.multiply(2.0, found.excitation))
     assert len(both.log.time) == 2 * len(found.log.time)
     pairs = [pair for pair in zip(found.estimates, both.estimates, strict=True) if pair[0].informed]

@@ -9,7 +9,7 @@ let timer = null;
 const element = (tag, attributes, parent, words) => {
   const made = document.createElementNS(NS, tag);
   for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
-  if (words) made.textContent = words;
+  if (words !== undefined) made.textContent = words;
   return parent.appendChild(made);
 };
 const crystal = () => crystals[scenario.value];
