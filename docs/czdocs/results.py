@@ -42,6 +42,9 @@ WHOLE = (
     ("kwh_per_kg", "heater's energy [kWh/kg]", "{:.2f}"),
 )
 """The same of whole crystals."""
+CASES = ("puller-frames", "melt-layer", "randomized-traced")
+"""Cases on request whose plant or ring no agent has met, and no controller is told."""
+COSTS = tuple(row for row in METRICS if row[0] in ("cost", "failure_rate"))
 Lines = list[str]
 
 
@@ -169,6 +172,9 @@ TABLES: dict[str, Callable[[], Lines]] = {
     "figures-pid": partial(figures, "benchmark", PIDS),
     "figures-lqg": partial(figures, "benchmark", LQGS),
     "figures-budgets": partial(figures, "budgets", BUDGETS, ("randomized", "puller")),
+    "figures-cases": partial(
+        figures, "cases", ("paper-tuned", "lqg", "lqg-at-0.02", "gradient", "ppo", "sac"), CASES, COSTS
+    ),
     "figures-bounds": partial(figures, "bounds", BOUNDS, SCENARIOS[:-1]),
     "faults": faults,
     "gaps": gaps,
