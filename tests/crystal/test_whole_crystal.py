@@ -161,6 +161,28 @@ def test_the_recipe_reads_as_the_design_says():
     assert table[8:60, 5].min() - p.T_m == pytest.approx(2.4, abs=0.1)
 
 
+@pytest.mark.parametrize(
+    ("value", "still", "moves"),
+    [
+        ("slope", (40, 55, 70), (39, 71)),
+        ("slope", (1140, 1200, 1245), (1139, 1246)),
+        ("v_g", (50, 60, 75), (49, 76)),
+        ("v_g", (135,), (134, 180)),
+        ("v_g", (1190, 1265), (1189,)),
+    ],
+)
+def test_slope_and_growth_rate_stand_still_between_the_lengths_of_the_design(value, still, moves):
+    """A crown of 90 mm, a body that ends at 1090 mm, a tail of 175 mm; lengths in mm."""
+    first, *others = (getattr(shape_at(L * MM, DESIGN, EPISODE), value) for L in (*still, *moves))
+    np.testing.assert_allclose(others[: len(still) - 1], first, rtol=1e-12)
+    assert (np.abs(np.array(others[len(still) - 1 :]) / first - 1.0) > 5e-7).all()
+
+
+def test_a_stage_that_begins_at_a_length_is_all_of_the_episodes():
+    q = complete(Parameters(), DEFAULT, 0.5)
+    assert [getattr(q, stage) for stage in plant.STAGES] == [stage == "body" for stage in plant.STAGES]
+
+
 def odd(**changes):
     return {"puller": PullerFile("odd", recipe=CrystalRecipe()._replace(**changes))}
 

@@ -199,10 +199,28 @@ def test_energy_and_time_are_those_of_the_recipe(stage):
     ],
 )
 def test_the_nearest_limit_says_how_a_crystal_was_lost(changes, way):
+    assert FAILURE_MODES[int(np.argmin(margins(**changes)))] == way
+
+
+@pytest.mark.parametrize(
+    ("changes", "way"),
+    [
+        ({"h_c": 0.6 * MM}, "frozen"),
+        ({"r_c": 95.5 * MM}, "off"),
+        ({"r_c": 99.5 * MM, "L": 0.05}, "off"),
+        ({"r_c": 2.0 * MM, "r_ref": 3.0 * MM, "L": 0.001}, "off"),
+        ({"T_b": 1685.0}, "cold"),
+    ],
+)
+def test_a_margin_is_zero_at_its_limit(changes, way):
+    assert margins(**changes)[FAILURE_MODES.index(way)] == pytest.approx(0.0, abs=1e-12)
+
+
+def margins(**changes):
     at = CRYSTAL.Logged(*[np.nan] * len(CRYSTAL.Logged._fields))._replace(
         **{"r_c": 87.5 * MM, "r_ref": 87.5 * MM, "h_c": 6.6 * MM, "L": 0.5, "T_b": 1690.0} | changes
     )
-    assert FAILURE_MODES[int(np.argmin(relative_margin(at, LIMIT, make_config(process=CRYSTAL).parameters)))] == way
+    return relative_margin(at, LIMIT, make_config(process=CRYSTAL).parameters)
 
 
 def test_a_frozen_crown_counts_once_and_with_the_largest_allowed_error():
