@@ -354,6 +354,7 @@ def test_weight_and_lean_info():
     assert info.keys() == {"r_c", "r_ref", "cost", "succeeded", "action_clipped"}
     seen = decode(observation, *env.config.ranges, env.config.process)
     assert abs(seen.weight) <= 0.5 * 9.81 * signals.WEIGHT_STEP + 1e-4
+    assert abs(seen.ring_error) < 0.05 * MM  # the crystal is on its recipe, the ring too
 
 
 def test_the_load_cell_is_as_noisy_as_its_scenario_says():
