@@ -296,7 +296,7 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base 
     if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer
         settings["learning_starts"] += done // recipe.action_repeat
     made: BaseAlgorithm = kind(policy, env, policy_kwargs=options, seed=seed, device="cpu", **settings)
-    if isinstance(made, apg.APG) and (agent := recipe.begun_with):
+    if isinstance(made, apg.APG) and isinstance(recipe, APG) and (agent := recipe.begun_with):
         try:
             made.policy.take_weights(agent.content)
         except CzError as error:

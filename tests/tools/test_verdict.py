@@ -29,6 +29,7 @@ from cz_gym.tools.report.markdown import brief, finding, terminal
 from cz_gym.tools.report.tables import FEWEST, NAMED, best_of_each_kind, chosen, looks_of
 from cz_gym.tools.report.task_records import body_verdict as verdict
 from cz_gym.tools.report.task_records import crystal_verdict
+from cz_gym.tools.run import typical_tasks
 from tests.observed import PLAIN
 from tests.samples import contender, joined, made, rolled_out
 
@@ -231,11 +232,11 @@ def test_the_finding_tells_those_who_are_told_apart_and_says_how_much_each_moves
     ]  # fmt: skip
     assert finding(made(cases, *who)) == (
         "**Of the controllers that are not told which scenario they meet, the learned agent `agent` ranks first.** "
-        "The best classical controller of them is `free`. Mean cost, which counts the radius error and the moves of "
-        "both drives: 0.2010 against 0.4020 on `randomized`; 0.2010 against 0.4020 on `hard`. Told the scenario, the "
-        "best are `told` on `randomized` (0.1005) and `told` on `hard` (0.1005). Radius error on `randomized`: `agent` "
-        "0.800, `free` 0.600, `told` 0.900 mm (RMSE); from sample to sample, their pull speed changes by 0.3000, "
-        "0.2000 and 0.5000 mm/min (RMS). No learned agent lost a crystal."
+        "The best classical controller of them is `free`. Cost counts the radius error and the moves of both drives. "
+        "Its mean is 0.2010 against 0.4020 on `randomized`, and 0.2010 against 0.4020 on `hard`. Of those told the "
+        "scenario, the best are `told` on `randomized` (0.1005) and `told` on `hard` (0.1005). On `randomized`, "
+        "`agent`, `free` and `told` have a radius error of 0.800, 0.600 and 0.900 mm (RMSE). Their pull speed changes "
+        "by 0.3000, 0.2000 and 0.5000 mm/min (RMS) from sample to sample. No learned agent lost a crystal."
     )
     who[3][1]["failure_rate"] = [0.0] * 19 + [1.0]
     said = "Learned agents lose at most 5.00 % of the crystals of a scenario (`agent` on `randomized`)."
@@ -243,7 +244,7 @@ def test_the_finding_tells_those_who_are_told_apart_and_says_how_much_each_moves
     who[3][1].pop("failure_rate")
     assert finding(made(cases, *who[1:])) == ""
     close = finding(made(cases, *who[:3], (who[3][0], steps(0.399, 0.3))))
-    assert "on `hard` (intervals overlap). Told" in close
+    assert "on `hard` (intervals overlap). Of those told" in close
 
 
 def test_the_plot_shows_all_whom_the_finding_names():
@@ -279,6 +280,18 @@ def test_the_crystal_that_pictures_show_is_usual_for_every_controller():
     assert tables.typical(benchmark, NOMINAL) == 2
     unknown = made(NOMINAL, (paper, {"rmse_mm": [np.nan] * 3}), (agent, {"rmse_mm": [1.0, 2.0, 4.0]}))
     assert tables.typical(unknown, NOMINAL) == 1
+
+
+def test_every_benchmark_shows_the_typical_crystal_of_each_case(tmp_path):
+    """Bodies and whole crystals, slow controllers too, an agent by its first training seed."""
+    cases = [find_case("hard"), find_case("crown", task_records.TASKS[CRYSTAL.name].cases)]
+    who = contender("paper", slow=True), contender("a", training_seeds=(3, 4))
+    benchmark = made(cases, *((each, {"rmse_mm": [0.1, 9.0, 1.0, 1.1]}) for each in who))
+    tasks = [
+        (each.name, each.training_seeds, case.name, seeds)
+        for each, case, seeds, _ in typical_tasks(benchmark, tmp_path)
+    ]
+    assert tasks == [(each.name, each.training_seeds[:1], case.name, [2]) for case in cases for each in who]
 
 
 @pytest.mark.parametrize("columns", [80, 200])

@@ -100,8 +100,13 @@ that the model does not have.
     return {path: text.encode(), readings: _readings(identified), numbers: _numbers(identified)}
 
 
+def _name_of(e: Estimate) -> tuple[str, str]:
+    """Return an estimate's name for readers and its unit."""
+    return OTHERS.get(e.name) or (e.name, describe()[e.name].unit)
+
+
 def _row(e: Estimate) -> tuple[str, ...]:
-    name, unit = OTHERS.get(e.name) or (e.name, describe()[e.name].unit)
+    name, unit = _name_of(e)
     if not e.excited:
         return name, unit, f"{e.prior:.4g}", "-", "-", "-", "not estimated: its drive was not excited"
     verdict = "told" if e.informed else "this log says nothing about it" if e.trusted else "not to be trusted"
@@ -344,8 +349,8 @@ def _main(given: argparse.Namespace) -> int:
         print(*(f"{path.name}: {note}" for note in log.notes), sep="\n", end="\n" if log.notes else "")
     write_files(report(identified, logs, names, page) | files)
     for e in identified.estimates:
-        said = f"{e.value:.4g} ({e.low:.4g} to {e.high:.4g})" if e.informed else "this log says nothing about it"
-        print(f"{e.name}: {said}")
+        told = f"{e.value:.4g} ({e.low:.4g} to {e.high:.4g}) {_name_of(e)[1]}"
+        print(f"{e.name}: {told if e.informed else 'this log says nothing about it'}")
     print(f"wrote {' and '.join(map(str, (*files, page)))}")
     return NO_FIT if identified.misfits else 0
 

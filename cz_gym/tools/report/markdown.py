@@ -173,16 +173,17 @@ def finding(benchmark: Benchmark) -> str:
     pairs = [_against(benchmark, case, best, other, cost) for case in cases]
     aware = [f"`{each.name}` on `{case.name}` ({cost.of(benchmark, case, each.name)})"
              for case, each in zip(cases, told, strict=True)]  # fmt: skip
-    errors = [f"`{each.name}` {error.of(benchmark, cases[0], each.name)}" for each in firsts[:3]]
-    moves = [step.of(benchmark, cases[0], each.name) for each in firsts[:3]]
+    three = ["{}, {} and {}".format(*each) for each in (
+        [f"`{each.name}`" for each in firsts[:3]],
+        *([column.of(benchmark, cases[0], each.name) for each in firsts[:3]] for column in (error, step)),
+    )]  # fmt: skip
     kinds = ["learned agent" if each.learned else "classical controller" for each in (best, other)]
     return (
         f"**Of the controllers that are not told which scenario they meet, the {kinds[0]} `{best.name}` ranks first.** "
-        f"The best {kinds[1]} of them is `{other.name}`. Mean cost, which counts the radius error and the moves of "
-        f"both drives: {'; '.join(pairs)}. Told the scenario, the best are {' and '.join(aware)}. Radius error on "
-        f"`{cases[0].name}`: {', '.join(errors)} mm (RMSE); from sample to sample, their pull speed changes by "
-        "{}, {} and {} mm/min (RMS). ".format(*moves)
-        + _lost_by_agents(benchmark)
+        f"The best {kinds[1]} of them is `{other.name}`. Cost counts the radius error and the moves of both drives. "
+        f"Its mean is {', and '.join(pairs)}. Of those told the scenario, the best are "
+        f"{' and '.join(aware)}. On `{cases[0].name}`, {three[0]} have a radius error of {three[1]} mm (RMSE). Their "
+        f"pull speed changes by {three[2]} mm/min (RMS) from sample to sample. {_lost_by_agents(benchmark)}"
     )
 
 
