@@ -144,6 +144,15 @@ class APG(TrainingConfig):
                 raise CzError(f"start={self.start}: its {what} is {its}, the recipe's is {own}")
         return agent
 
+    def begin(self, algorithm: Any) -> None:
+        """Give an algorithm weights and feature statistics of the agent of ``start``, if one is named."""
+        if agent := self.begun_with:
+            algorithm.warm_up = 0.0
+            try:
+                algorithm.policy.take_weights(agent.content)
+            except CzError as error:
+                raise CzError(f"start={self.start}: {error}") from None
+
 
 @dataclass(frozen=True, kw_only=True)
 class Reinforcement(TrainingConfig):
@@ -291,16 +300,11 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base 
     if isinstance(recipe, Reinforcement):
         settings["learning_rate"] = partial(linear_schedule, recipe.learning_rate)
         options["net_arch"] = {"pi": list(recipe.hidden), critics: list(recipe.critic_hidden)}
-    if isinstance(recipe, APG) and recipe.start:
-        settings["warm_up"] = 0.0
     if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer
         settings["learning_starts"] += done // recipe.action_repeat
     made: BaseAlgorithm = kind(policy, env, policy_kwargs=options, seed=seed, device="cpu", **settings)
-    if isinstance(made, apg.APG) and isinstance(recipe, APG) and (agent := recipe.begun_with):
-        try:
-            made.policy.take_weights(agent.content)
-        except CzError as error:
-            raise CzError(f"start={recipe.start}: {error}") from None
+    if isinstance(recipe, APG):
+        recipe.begin(made)
     # The algorithm's constructor has set the slots' seeds to ``seed`` and those after it: neighbouring training seeds
     # would meet the same crystals, and a resumed run its first ones again.
     made.set_random_seed((seed * 10_007 + done) % (len(TRAINING_SEEDS) - recipe.num_envs))
