@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from cz_gym.config import Config, check_config
 from cz_gym.crystal.process import ENVIRONMENTS
+from cz_gym.evaluation.protocol import GROUPS
 from cz_gym.puller.file import DEFAULT
 from cz_gym.spaces import ACTIONS, CLIP, TargetEnv, observations, tag
 from cz_gym.support.command_line import missing
@@ -128,16 +129,38 @@ def facts_of(config: Config) -> dict[str, Any]:
     }
 
 
+def check_environment(contract: Contract, config: Config, name: str | Path) -> None:
+    """Raise AgentFileError, with ``name`` at its front, for an agent of another environment than the config's."""
+    environment, own = contract.environment, config.process.name or "an environment of your own"
+    if environment != own:
+        raise AgentFileError(
+            f'{name}: trained for {environment}, not for {own}: gym.make("{environment}", **agent.settings) is its '
+            f"environment, --env {environment} the option of cz-gym benchmark"
+        )
+
+
 def make_contract(onnx_bytes: bytes, **facts: Any) -> Contract:
     """Make the contract of an ONNX file; ``facts`` are its fields without the hashes of observation and file.
 
     AgentFileError for a value that no contract may hold.
     """
     digest = hashlib.sha256(onnx_bytes).hexdigest()
-    known = {**ADDED_FIELDS, **facts, "sha256": digest}
-    known["observation_hash"] = observation_hash(facts["observation"], known["environment"])
+    known = {**plain_facts(facts), "sha256": digest}
+    known["observation_hash"] = observation_hash(known["observation"], known["environment"])
     _check(known, "contract")
     return Contract(**known)
+
+
+def plain_facts(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """All facts of a contract, Python's numbers in place of NumPy's; AgentFileError for missing or unknown ones."""
+    plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in facts.items()}
+    given = {**ADDED_FIELDS, **plain}
+    odd = sorted(set(given) ^ {each.name for each in fields(Contract)} - {"sha256", "observation_hash"})
+    if odd:
+        lacking = [name for name in odd if name not in given]
+        what = f"missing {', '.join(lacking)}" if lacking else f"unknown {', '.join(odd)}"
+        raise AgentFileError(f"an agent's facts: {what:.160} (cz_gym.agents.contract.facts_of(config) gives some)")
+    return given
 
 
 def agent_files(path: Path, onnx_bytes: bytes, contract: Contract) -> dict[Path, bytes]:
@@ -147,21 +170,29 @@ def agent_files(path: Path, onnx_bytes: bytes, contract: Contract) -> dict[Path,
     return {path: onnx_bytes, path.with_suffix(".json"): text.encode()}
 
 
-def write_agent(path: Path, onnx_bytes: bytes | Path, **facts: Any) -> Contract:
+def write_agent(path: str | Path, onnx_bytes: bytes | str | Path, **facts: Any) -> Contract:
     """Write an agent file with its contract; ``facts`` as for :func:`make_contract`.
 
     The ONNX model, or its file, may be any exporter's (:mod:`cz_gym.agents.exported`); AgentFileError for a graph that
     agents may not have.
     """
+    path, facts = Path(path), plain_facts(facts)
     content = plain_graph(onnx_bytes, facts["channels"], path)
     contract = make_contract(content, **facts)
     write_files(agent_files(path, content, contract))
     return contract
 
 
-def plain_graph(source: bytes | Path, channels: int, path: str | Path) -> bytes:
+def plain_graph(source: bytes | str | Path, channels: int, path: str | Path) -> bytes:
     """An ONNX model, or its file, as the graph of the agent ``path``; AgentFileError where it cannot become one."""
-    content = source.read_bytes() if isinstance(source, Path) else source
+    source = Path(source) if isinstance(source, str) else source
+    if isinstance(source, Path):
+        try:
+            content = source.read_bytes()
+        except OSError as error:
+            raise AgentFileError(f"{source}: cannot be read ({error.strerror})") from None
+    else:
+        content = source
     try:
         check_graph(content, channels)
         return content
@@ -235,6 +266,8 @@ def _check(given: Mapping[str, Any], where: Path | str) -> None:
     for each in fields(Contract):
         if wrong := _wrong(each.type, given[each.name]):
             raise AgentFileError(f"{where}: field {each.name!r} must be {wrong}, not {given[each.name]!r:.80}")
+    if given["learned_from"] not in GROUPS:
+        raise AgentFileError(f"{where}: learned_from must be in {', '.join(GROUPS)}, not {given['learned_from']!r:.80}")
 
 
 def _wrong(kind: Any, value: Any) -> str | None:
@@ -306,10 +339,7 @@ class OnnxPolicy:
                 f"{expected}, or others, or other scales"
             )
         if config is not None:
-            if environment != (own := check_config(config).process.name):
-                raise AgentFileError(
-                    f"{path}: trained for {environment}, not for {own or 'an environment of your own'}"
-                )
+            check_environment(contract, check_config(config), path)
             for what, own, other in (
                 ("puller", contract.puller, config.puller.label),
                 ("plant", contract.plant_hash, config.plant_hash),

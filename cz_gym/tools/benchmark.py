@@ -166,6 +166,9 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
     wanted = wanted_names(arguments, cases, [*given] or ([] if arguments.puller else shipped))
     for name in wanted:
         if name not in known:
+            for env, task in TASKS.items():
+                if name in shipped_names(env) or name in [each.name for each in task.controllers()]:
+                    raise CzError(f"{name!r} is for {env}: add --env {env}")
             raise CzError(unknown_name_message("controller", name, known, ", or all"))
     chosen = [each for each in controllers if each.name in wanted]
     check_quick(chosen, arguments, cases)

@@ -77,7 +77,7 @@ def _loaded(given: argparse.Namespace) -> tuple[Any, Config]:
 
 def _declared(contract: Contract) -> list[tuple[str, str]]:
     """Facts of a contract that are taken from it, not measured."""
-    told = f"{contract.training_steps:,} steps, seed {contract.training_seed}, {GROUPS.get(contract.learned_from, '?')}"
+    told = f"{contract.training_steps:,} steps, seed {contract.training_seed}, {GROUPS[contract.learned_from]}"
     cost = f"RMSE {contract.validation_rmse_mm:.3f} mm, cost {contract.validation_cost:.4g} on its maker's validation"
     return [
         ("agent", f"{contract.algorithm}, hash {contract.hash[:12]}"),

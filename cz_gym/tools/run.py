@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from cz_gym.agents import OnnxPolicy
+from cz_gym.agents.contract import check_environment
 from cz_gym.engine.batch import processors
 from cz_gym.evaluation.metrics import OUTSIDE, SPEED, names_of, outside
 from cz_gym.evaluation.parallel import run_parallel
@@ -175,6 +177,8 @@ def check_agents(contenders: Sequence[Contender], cases: Sequence[Case]) -> None
             config, kind = case.design_config(each.observation, each.action), "agent" if each.learned else "controller"
             for policy in each.policies(config) if each.own else each.trained:
                 try:
+                    if isinstance(policy, OnnxPolicy):
+                        check_environment(policy.contract, config, "its file")
                     check_policy(policy, config)
                 except CzError as error:
                     raise CzError(f"{kind} {each.name!r} on {case.name}: {error}") from None

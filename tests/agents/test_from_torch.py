@@ -264,6 +264,31 @@ def test_what_no_agent_may_hold_is_not_written(tmp_path, model, says):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"colour": 1}, "facts: unknown colour"),
+        ({"training_steps": None, "training_seed": None}, "facts: missing training_seed, training_steps"),
+        ({"channels": None}, r"facts: missing channels \(cz_gym.agents.contract.facts_of"),
+        ({"learned_from": "magic"}, "learned_from must be in reward, state, plant, not 'magic'"),
+    ],
+)
+def test_facts_of_an_agent_are_complete_and_known(tmp_path, changes, says):
+    given = {name: value for name, value in {**measured_facts(), **changes}.items() if value is not None}
+    with pytest.raises(AgentFileError, match=says):
+        write_agent(tmp_path / "a.onnx", exported(MLP(nn.Tanh()), []), **given)
+    assert not list(tmp_path.iterdir())
+
+
+def test_names_of_files_and_numbers_of_numpy_are_taken(tmp_path):
+    (tmp_path / "m.onnx").write_bytes(exported(MLP(nn.Tanh()), []))
+    given = {**measured_facts(), "training_steps": np.int64(9), "validation_cost": np.float32(0.5)}
+    contract = write_agent(str(tmp_path / "a.onnx"), str(tmp_path / "m.onnx"), **given)
+    assert OnnxPolicy.load(tmp_path / "a.onnx").contract == contract
+    with pytest.raises(AgentFileError, match=r"none.onnx: cannot be read \(No such file"):
+        write_agent(tmp_path / "b.onnx", str(tmp_path / "none.onnx"), **given)
+
+
 @pytest.fixture
 def quick(monkeypatch):
     monkeypatch.setattr(recipes, "JUDGING_SEEDS", recipes.JUDGING_SEEDS[:4])

@@ -14,10 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cz_gym import agents
+from cz_gym.agents.contract import check_environment
 from cz_gym.baselines.fallback import fallback
 from cz_gym.body.process import BODY
 from cz_gym.body.signals import Measured
 from cz_gym.config import Config
+from cz_gym.crystal.process import CRYSTAL
 from cz_gym.engine.kernels import update_history, write_history
 from cz_gym.process import scales
 from cz_gym.puller.file import DEFAULT
@@ -174,10 +176,10 @@ def make_block(name: str, config: Config) -> Block:
     CzError if there is none of that name, if it cannot be exported, or if an agent is of another puller.
     """
     known = {entry.name: entry for entry in CONTROLLERS if not entry.bound}
-    crystal = {entry.name for entry in CRYSTAL_CONTROLLERS} - known.keys()
+    crystal = {*(entry.name for entry in CRYSTAL_CONTROLLERS), *agents.shipped_names(CRYSTAL.name)} - known.keys()
     plant = f"Puller {config.puller.label}; plant {config.plant_hash}; control interval {config.control_interval:g} s."
     if name in crystal:
-        raise CzError(f"{name} cannot be exported: controllers of whole crystals stay in Python")
+        raise CzError(f"{name} cannot be exported: controllers and agents of whole crystals stay in Python")
     if name not in (*known, FALLBACK, *agents.shipped_names()) and Path(name).suffix != ".onnx":
         raise CzError(unknown_name_message("controller or agent", name, [*known, FALLBACK, *agents.shipped_names()]))
     pid, *margins = fallback(config)
@@ -201,6 +203,7 @@ def make_block(name: str, config: Config) -> Block:
         facts = f"Controller {name}: {known[name].meaning}.", f"{tuned}.", plant, takes_over
         return Block(identifier, controller, pid, config, facts)
     contract = (policy := agents.load(name)).contract
+    check_environment(contract, config, name)
     its, own = (
         f"puller {each.puller}, plant {each.plant}, control interval {each.control_interval:g} s"
         for each in (policy.made_for, config.made_for)
