@@ -215,7 +215,7 @@ def test_a_file_may_be_named_and_stand_beside_the_shipped_agents(tmp_path):
     file = constant_agent(tmp_path / "some.onnx", algorithm="ppo")
     found = contenders("--controllers", "paper,mine,gradient", "--agent", f"mine={file}")
     assert [each.name for each in found] == ["paper", "mine", "gradient"]
-    everything = "0.175 hard + 0.175 hot-zone + 0.175 puller + 0.3 randomized + 0.175 sensor-fault"
+    everything = "0.2 hard + 0.1 hot-zone + 0.3 puller + 0.1 randomized + 0.3 sensor-fault"
     trained_on = [each.meaning.partition(" on ")[2] for each in found[1:]]
     assert trained_on == ["randomized, given as a file", everything]
     assert [len(each.trained) for each in found] == [0, 1, len(found[2].training_seeds)]
