@@ -204,6 +204,8 @@ FOLLOWING_ERROR = 0.05
 """Distance from its setpoint from which a drive does not follow, in shares of its range [-]."""
 TOLD_ERROR = 0.25
 """Error of a drive's reading that raises a bit, in shares of the largest one that counts as such [-]."""
+STILL_DRIVE = 0.001
+"""Change of a drive's difference that counts as none, in shares of its range [-]."""
 STILL_RING = 1e-6 * MM
 """Change of a ring that counts as none [m]."""
 RING_TIME, RING_GROWTH = 30.0, 1.0 * MM / MINUTE
@@ -270,6 +272,8 @@ class Memory(NamedTuple):
     """Error of the nominal temperature, as the takeover found it [K]."""
     Q_H_offset: Any
     """Error of the nominal power, as the takeover found it [W]."""
+    T_1_level: Any
+    """Mean heater temperature above its recipe while the controller held the crystal by good readings [K]."""
     unsure: Any
     """1 from a takeover until its setpoints are known to be right."""
     sent_pull: Any
@@ -489,6 +493,8 @@ class Drive(NamedTuple):
     """Part of the difference that counts as an error of the reading."""
     errs: Any
     """True if the error is large enough to raise a bit."""
+    still: Any
+    """True if the difference stands still: the drive has arrived."""
 
     @property
     def away(self) -> Any:
@@ -544,7 +550,8 @@ def drive_of(
     error = np.clip(difference, -largest, largest)
     errs = np.abs(error) > TOLD_ERROR * largest
     far = FOLLOWING_ERROR * full
-    return Drive(known, applied, held, nominal, far, given[slew], span, sent, difference, error, errs)
+    still = before & (np.abs(applied - sent - averaged) <= STILL_DRIVE * full)
+    return Drive(known, applied, held, nominal, far, given[slew], span, sent, difference, error, errs, still)
 
 
 def finite(value: Any) -> Any:

@@ -61,6 +61,8 @@ power [share of the heater's range]. The rest counts as an error of the nominal 
 READING_ERROR_TIME, LIMITED = 5.0 * MINUTE, 0.5
 """Time after which an error of a drive's reading counts [s]; mean side of the cuts, averaged over PULL_BIAS_TIME, from
 which limiting does [-]. What noise cuts on both sides is no limiting."""
+ARRIVAL_TIME, LEVEL_TIME = 4.0 * MINUTE, 10.0 * MINUTE
+"""Longest wait of a takeover for a slow heater [s]; averaging time of the heater temperature above its recipe [s]."""
 FAR_PULL = 0.05
 """Relative deviation of the pull speed from nominal with which a takeover begins with the PID [-]."""
 SETTLED_TIME = 30.0 * MINUTE
@@ -113,9 +115,16 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     drive_error_time = np.where(call.later, memory.drive_error_time, held_error)
     lost = drive_error_time > DRIVE_ERROR_TIME
     follows = runs & ~lost
-    # Setpoints that a takeover read wrong are set right once, when that has shown; then the controller begins.
+    fallen, wait = runs & (memory.fallback > 0.5), given["return_after_s"]
+    # Setpoints that a takeover read wrong are set right once, when that has shown; then the controller begins. The PID
+    # that brings back what an operator left far from nominal acts at once, where the slew rate makes that gradual.
     takeover, unsure = given["takeover_s"], ~runs | (memory.unsure > 0.5)
-    corrects = runs & unsure & (takeover > 0.0) & (2.0 * (memory.since_takeover + dt) >= takeover)
+    gradual = drives[0].slew * (dt / MINUTE) <= FAR_PULL * drives[0].nominal
+    brings_back = fallen & unsure & (takeover > 0.0) & gradual
+    waited = memory.since_takeover + dt - np.where(brings_back, 1.0, 0.5) * takeover
+    arrived = drives[1].still | brings_back | (waited >= ARRIVAL_TIME)
+    settles = runs & unsure & (takeover > 0.0) & (waited >= 0.0) & arrived
+    corrects = settles & ~brings_back
     told_drives = {
         name: np.where(runs, (each.told(follows, corrects) - given[nominal]) * unit, getattr(raw, name))
         for each, (name, (_, nominal, _, unit)) in zip(drives, list(READINGS.items())[-2:], strict=True)
@@ -129,23 +138,20 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     check = getattr(controller, "model_mismatch", None)
     unexplained = check(memory.controller) if check else False
     mismatch = (settled_time > SETTLED_TIME) & unexplained
-    fallen, wait = runs & (memory.fallback > 0.5), given["return_after_s"]
     # A model that lost the crystal without readings begins anew, and is watched for all of the wait.
     confused = fallen & (memory.stays < 0.5) & unexplained
     distance = np.abs(seen.ring.level - seen.read.r_ref)
     beyond = engaged & finite(seen.ring.level) & (distance > given["radius_limit_mm"] * MM)
     calm = (2.0 * distance < given["radius_limit_mm"] * MM) & (np.abs(memory.pull_bias) < FAR_PULL)
     good_time = np.where(fallen & good & seen.pyrometer & calm & ~confused, memory.good_time + dt, 0.0)
-    # What an operator leaves far from nominal is brought back by the PID.
     far = beyond | (np.abs(raw.v_p) > FAR_PULL * given["nominal_pull_speed_mm_per_min"] * MM_PER_MIN)
     begins_far = engaged & ~runs & far & (wait > 0.0)
-    gradual = drives[0].slew * (dt / MINUTE) <= FAR_PULL * drives[0].nominal  # any other drive would jump there
-    brings_back = fallen & unsure & (takeover > 0.0) & gradual
     returns = fallen & (memory.stays < 0.5) & (wait > 0.0) & (good_time >= wait)
     fallback = runs & ~returns & (fallen | (bad_readings_time > given["fallback_after_s"]) | mismatch)
-    since_takeover = np.where(fallback & ~fallen | returns, 0.5 * takeover, memory.since_takeover + dt)
+    since_takeover = np.where(fallback & ~fallen | returns | corrects, 0.5 * takeover, memory.since_takeover + dt)
     since_takeover = np.where(runs, since_takeover, 0.0)
     authority = np.clip(2.0 * since_takeover / np.maximum(takeover, 1e-3) - 1.0, 0.0, 1.0)
+    authority = np.where(brings_back, 1.0, np.where(unsure & (takeover > 0.0), 0.0, authority))
 
     # Errors of the nominal values, as the takeover finds them, are taken off all later readings.
     at_takeover = np.where(seen.pyrometer, _excess(seen.read.T_1, TRIM_T_1), 0.0)
@@ -165,7 +171,9 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     if (fallback | ~(finite(own[0]) & finite(own[1]))).any():
         # Its heater makes the mean pull nominal: the operator's, as its integral, would stand in the radius for hours.
         begun = pid.at_rest(read._replace(v_p=np.where(brings_back, 0.0, read.v_p)))
-        other = pid.step(read, select(fallen & (memory.unsure < 0.5), memory.pid, begun))
+        acts = fallen & ((memory.unsure < 0.5) | (brings_back & (memory.since_takeover > 0.0)))
+        # Nor does it know by how much the heater is warmer than the recipe for that pull; the last minutes do.
+        other = pid.step(read._replace(T_1=read.T_1 - memory.T_1_level), select(acts, memory.pid, begun))
     pull, heater = (
         np.where(fallback, second, first) / unit + at
         for first, second, unit, at in zip(own[:2], other[:2], (MM_PER_MIN, KILO), nominal, strict=True)
@@ -179,13 +187,11 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     trim = FOLLOWED * constants.feed * moved + constants.trim * (bias - memory.pull_bias + dt / constants.slow * bias)
     # Any other pull than the mean one grows into the radius unseen, and the last one is none.
     no_ring = ~seen.ring.good & (fallback | (False if observes else memory.no_ring_time > NO_RING_TIME))
-    goes_back = brings_back & ~corrects
-    wanted = np.where(no_ring | goes_back, nominal[0], pull), np.where(blind, old[1] + trim / KILO, heater)
+    wanted = np.where(no_ring, nominal[0], pull), np.where(blind, old[1] + trim / KILO, heater)
     sound = finite(wanted[0]) & finite(wanted[1])
-    shares = np.where(goes_back, 1.0, authority), authority
     moves = [
-        each.move(start, np.where(sound, target, start), share, dt)
-        for each, start, target, share in zip(drives, old, wanted, shares, strict=True)
+        each.move(start, np.where(sound, target, start), authority, dt)
+        for each, start, target in zip(drives, old, wanted, strict=True)
     ]
     sides = [
         np.where(runs, mean + min(dt / PULL_BIAS_TIME, 1.0) * (side - mean), 0.0)
@@ -202,7 +208,8 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
         Alarm.RING: ~seen.ring.good, Alarm.PYROMETER: ~seen.pyrometer, Alarm.DRIVES: ~known,
         Alarm.REFERENCE: ~seen.reference, Alarm.LATE: call.late, Alarm.CLOCK: ~call.sound,
         Alarm.PULL_LIMITED: np.abs(sides[0]) > LIMITED, Alarm.HEATER_LIMITED: np.abs(sides[1]) > LIMITED,
-        Alarm.TAKEOVER: engaged & (authority < 1.0), Alarm.FALLBACK: fallback, Alarm.FAILED: engaged & ~sound,
+        Alarm.TAKEOVER: engaged & ((authority < 1.0) | (since_takeover < takeover)),
+        Alarm.FALLBACK: fallback, Alarm.FAILED: engaged & ~sound,
         Alarm.MANUAL: ~engaged, Alarm.SETTINGS: ~sane, Alarm.ASTRAY: lost, Alarm.MODEL: mismatch,
         Alarm.READING_ERROR: reading_error_time > READING_ERROR_TIME, Alarm.RING_STEP: seen.ring.stepped,
         Alarm.RADIUS: radius_time > given["radius_limit_s"],
@@ -211,14 +218,17 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     errors = (np.where(runs, each.error, 0.0) for each in drives)
     outputs = dict(zip((port.name for port in OUTPUTS), (*setpoints, alarms, *errors), strict=True))
     stays = np.where(fallback & ((memory.stays > 0.5) | mismatch) | (engaged & ~sound), 1.0, 0.0)
+    pace = np.where(good & seen.pyrometer & ~fallback, min(dt / LEVEL_TIME, 1.0), 0.0)
+    level = memory.T_1_level + pace * (read.T_1 - read.T_1_ref - memory.T_1_level)
+    level = np.where(runs & (stays < 0.5), level, 0.0)
     now = Memory(
         clock_s=call.clock, called_s=given["time_s"], late=np.where(call.late, 1.0, 0.0), samples=call.samples,
         engaged=np.where(engaged, 1.0, 0.0), since_takeover=since_takeover, bad_readings_time=bad_readings_time,
         fallback=np.where(fallback | begins_far | (engaged & ~sound), 1.0, 0.0), pull=setpoints[0],
         heater=setpoints[1], drive_error_time=drive_error_time, last_T_1=seen.last_T_1,
         frozen_time=seen.frozen_time, no_pyrometer_time=no_pyrometer_time, pull_bias=bias,
-        settled_time=settled_time, T_1_offset=T_1_offset, Q_H_offset=Q_H_offset, unsure=np.where(unsure &
-        ~corrects, 1.0, 0.0), sent_pull=drives[0].sent, sent_heater=drives[1].sent,
+        settled_time=settled_time, T_1_offset=T_1_offset, Q_H_offset=Q_H_offset, T_1_level=level,
+        unsure=np.where(unsure & ~settles, 1.0, 0.0), sent_pull=drives[0].sent, sent_heater=drives[1].sent,
         pull_difference=drives[0].difference, heater_difference=drives[1].difference,
         reading_error_time=reading_error_time, pull_limited=sides[0], heater_limited=sides[1],
         good_time=good_time, stays=stays, last_ring=seen.ring.last, ring_still_time=seen.ring.still_time,
