@@ -70,10 +70,10 @@ class _Panel(NamedTuple):
 
 _PANELS = (
     _Panel("radius error [mm]", lambda s: (s.r_c - s.r_ref) / MM),
-    _Panel("pull speed, 5 min mean [mm/min]", lambda s: s.v_p / MM_PER_MIN, lambda s: s.v_p_ref / MM_PER_MIN, True),
-    _Panel("heater power, 5 min mean [kW]", lambda s: s.Q_H / KILO, lambda s: s.Q_H_ref / KILO, True),
+    _Panel("pull speed [mm/min]", lambda s: s.v_p / MM_PER_MIN, lambda s: s.v_p_ref / MM_PER_MIN, True),
+    _Panel("heater power [kW]", lambda s: s.Q_H / KILO, lambda s: s.Q_H_ref / KILO, True),
     _Panel("meniscus height [mm]", lambda s: s.h_c / MM, lambda s: s.h_ref / MM),
-    _Panel("v/G, 5 min mean, of the recipe's [-]", lambda s: s.v_over_G, lambda s: np.ones_like(s.L), True),
+    _Panel("v/G of recipe's [-]", lambda s: s.v_over_G, lambda s: np.ones_like(s.L), True),
 )
 TALLEST, WIDE = 6.0, 8.0
 """Height of the largest profile, and width of the figure [in]."""
@@ -120,5 +120,5 @@ def _by_length(benchmark: Benchmark, case: Case) -> bytes:
         axis.set(xlim=ends, ylim=(low - 0.1 * (high - low), high + 0.1 * (high - low)))
         axis.set_ylabel(panel.label.replace(" [", "\n["))
     axis.set_xlabel("length [mm]")
-    figure.suptitle(f"{_title(benchmark, case)}; dashed: the recipe", fontsize=10.5)
+    figure.suptitle(f"{_title(benchmark, case)}; dashed: the recipe\ndrives and v/G: 5 min means", fontsize=10.5)
     return png(figure)
