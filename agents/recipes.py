@@ -29,9 +29,9 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.sb3 import ActionRepeat, AddToController, CzVecEnv
 from cz_gym.support.errors import CzError, require_type
 
-from . import OnnxPolicy, apg, load
+from . import apg
 from .asymmetric import AsymmetricPolicy, AsymmetricSACPolicy
-from .contract import Contract
+from .contract import Contract, OnnxPolicy
 from .residual import Base, Residual
 
 LEAST_ENVS, LEAST_BATCH = 8, 64
@@ -114,7 +114,7 @@ class APG(TrainingConfig):
     window: int = 180
     """Steps of a crystal that a gradient goes back through."""
     start: str = ""
-    """Agent whose weights are learned on, a shipped one's name or a file; empty: random weights."""
+    """Agent file whose weights are learned on; empty: random weights. ``--set start=`` takes a shipped name too."""
     units: int = 128
     """Width of the memory (a gated recurrent unit) and of the hidden layer."""
     fewest_updates: int = 400
@@ -138,7 +138,7 @@ class APG(TrainingConfig):
         """The agent of ``start``; CzError if the recipe's agents read, act or grow otherwise."""
         if not self.start:
             return None
-        agent, environment = load(self.start), self.environment or BODY_ENV
+        agent, environment = OnnxPolicy.load(self.start), self.environment or BODY_ENV
         for what, own in (("environment", environment), ("observation", self.observation), ("action", self.action)):
             if (its := getattr(agent.contract, what)) != own:
                 raise CzError(f"start={self.start}: its {what} is {its}, the recipe's is {own}")

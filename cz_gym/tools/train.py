@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
+from cz_gym.agents import shipped
 from cz_gym.agents.recipes import (
     CRYSTAL_ENV,
     CRYSTAL_RECIPES,
@@ -182,6 +183,8 @@ def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tupl
     given = {"scenario": arguments.scenario, "puller": arguments.puller}
     chosen |= {field: value for field, value in given.items() if value}
     chosen |= dict(_setting(text, own) for text in arguments.set)
+    if (start := chosen.get("start")) and Path(start).suffix != ".onnx":
+        chosen["start"] = str(shipped(start))
     steps = arguments.steps or saved.get("steps") or own.steps
     recipe = replace(own.with_steps(steps), **chosen)
     chosen_puller(recipe.puller or None)

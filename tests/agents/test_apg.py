@@ -245,7 +245,7 @@ def test_apg_lowers_the_cost_in_a_few_updates():
 
 def test_a_training_goes_on_from_an_agents_weights(tmp_path):
     """Before the first update the policy acts as the agent does, and the features keep their statistics."""
-    recipe = replace(RECIPES["gradient"], start="gradient", num_envs=8)
+    recipe = replace(RECIPES["gradient"], start=str(agents.shipped("gradient")), num_envs=8)
     begun, agent = make_algorithm(recipe, 0), agents.load("gradient")
     seen = np.random.default_rng(0).normal(0.0, 0.1, (4, 12)).astype(np.float32)
     memory, mean = np.full((4, 160), 0.1, np.float32), begun.policy.mean.clone()
@@ -261,12 +261,14 @@ def test_a_training_goes_on_from_an_agents_weights(tmp_path):
     ("fields", "message"),
     [
         ({"units": 64}, "a memory of 128 units, not 64: --set units=128"),
-        ({"start": "ppo"}, "its observation is history, the recipe's is measured"),
-        ({"start": "gradient-along"}, "its environment is CzCrystal-v0, the recipe's is Cz-v0"),
-        ({"start": "nobody"}, "unknown shipped agent"),
+        ({"start": str(agents.shipped("ppo"))}, "its observation is history, the recipe's is measured"),
+        ({"start": str(agents.shipped("gradient-along"))}, "its environment is CzCrystal-v0, the recipe's is Cz-v0"),
+        ({"start": "nobody.onnx"}, "no such file"),
     ],
 )
 def test_an_agent_that_cannot_be_learned_on_is_refused(fields, message):
     """In one line that says what differs."""
     with pytest.raises(CzError, match=message):
-        make_algorithm(replace(RECIPES["gradient"], **{"start": "gradient", "num_envs": 8} | fields), 0)
+        make_algorithm(
+            replace(RECIPES["gradient"], **{"start": str(agents.shipped("gradient")), "num_envs": 8} | fields), 0
+        )
