@@ -294,7 +294,7 @@ def test_the_disturbances_of_a_log_grow_the_same_ring_within_its_noise(tmp_path)
 
 
 def test_the_command_writes_the_puller_and_its_report(logs, found, tmp_path, monkeypatch):
-    monkeypatch.setattr(command, "identify", lambda *_: found)
+    monkeypatch.setattr(command, "identify", lambda *_, **__: found)
     out = tmp_path / "new" / "my.toml"
     assert command.main([str(logs[0]), "--out", str(out)]) == 0
     files = {file.name for file in out.parent.iterdir()}
@@ -378,7 +378,7 @@ def test_a_loop_that_the_posterior_makes_unstable_is_said_to_be(monkeypatch):
 def test_a_model_that_does_not_fit_is_no_result(logs, found, tmp_path, monkeypatch, capsys):
     doubted = [tuple(e._replace(trusted=False) for e in each) for each in (found.estimates, found.noise)]
     odd = replace(found, estimates=doubted[0], noise=doubted[1], misfits=("its T_1 is 1796 K where the log says 1758",))
-    monkeypatch.setattr(command, "identify", lambda *_: odd)
+    monkeypatch.setattr(command, "identify", lambda *_, **__: odd)
     out = tmp_path / "my.toml"
     assert command.main([str(logs[0]), str(logs[0]), "--out", str(out)]) == command.NO_FIT
     assert capsys.readouterr().out.startswith("THE MODEL DOES NOT FIT: its T_1 is 1796 K")
