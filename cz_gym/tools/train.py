@@ -183,12 +183,13 @@ def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tupl
     given = {"scenario": arguments.scenario, "puller": arguments.puller}
     chosen |= {field: value for field, value in given.items() if value}
     chosen |= dict(_setting(text, own) for text in arguments.set)
-    if (start := chosen.get("start")) and Path(start).suffix != ".onnx":
-        chosen["start"] = str(shipped(start))
+    if start := chosen.get("start"):
+        chosen["start"] = str(Path(start).absolute() if Path(start).suffix == ".onnx" else shipped(start))
     steps = arguments.steps or saved.get("steps") or own.steps
     recipe = replace(own.with_steps(steps), **chosen)
     chosen_puller(recipe.puller or None)
     check_config(recipe.config)
+    _ = recipe.steps_before  # an agent that cannot be learned on is refused before the work
     return recipe, saved.get("seed", 0) if arguments.seed is None else arguments.seed
 
 
