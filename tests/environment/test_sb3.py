@@ -212,7 +212,7 @@ def test_an_estimate_is_fitted_to_the_state_and_not_to_the_reward():
     assert all(map(torch.equal, before, estimator.parameters()))
     seen = torch.tensor(model.rollout_buffer.observations).reshape(-1, *told.observation_space.shape)
     start = estimator.loss(seen).item()
-    model.learn(960, LearnState())
+    model.learn(1920, LearnState())
     assert estimator.loss(seen).item() < 0.75 * start
     with torch.no_grad():  # an estimator that is right, in the units of its features
         state = seen[:, estimator.gains.numel() :][:, [0, 1, 2, 3, 4, 14, 15, 16, 17]] * estimator.state_gains
