@@ -199,7 +199,7 @@ def make_config(
     """
     named: Any = ENVIRONMENTS.get(process, process) if isinstance(process, str) else process or BODY
     simulated: Process = require_type(Process, named, "cz_gym.body.process.BODY is one")
-    machine, meniscus = find_puller(puller), _find_meniscus(meniscus)
+    machine, shape = find_puller(puller), _find_meniscus(meniscus)
     scenario, parameters = _scenario_of(scenario), _fields_of((Parameters, CrystalParameters), parameters)
     seen: Camera | None = _fields_of((Camera,), camera)
     if puller is not None and parameters is not None:
@@ -208,15 +208,9 @@ def make_config(
     mix_of(model, drawn_from)
     _check_modes(observation, action, seen)
     interval = positive("control_interval", machine.control_interval if control_interval is None else control_interval)
-    shape = meniscus or HURLE
-    if not isinstance(shape, MeniscusModel):
-        raise CzError(f"meniscus must be a cz_gym.MeniscusModel, not {meniscus!r}")
     given = machine.parameters if parameters is None else parameters
     checked = simulated.check(simulated.complete(given, machine, stage), shape)
-    length = positive("horizon", simulated.duration(checked, shape, interval) if horizon is None else horizon)
-    steps = length / interval
-    if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
-        raise CzError(f"horizon {length:g} s must be a whole number of control intervals of {interval:g} s")
+    length = _whole_steps(simulated.duration(checked, shape, interval) if horizon is None else horizon, interval)
     pose = machine.pose(machine.parameters) if parameters is None else pose_for(checked)
     checked_camera = check_camera(camera_for(checked, pose) if seen is None else seen, checked)
     if seen is not None and hasattr(checked, "lens_x"):
@@ -233,13 +227,25 @@ MENISCI = HURLE.name, "young-laplace"
 """Names of the menisci of this package."""
 
 
-def _find_meniscus(given: Any) -> Any:
-    """The meniscus of a name; anything else as it is."""
-    if given != MENISCI[1]:
-        return HURLE if given == HURLE.name else given
-    from cz_gym.physics.young_laplace import YOUNG_LAPLACE  # it reads tables that are seldom needed
+def _find_meniscus(given: Any) -> MeniscusModel:
+    """The meniscus of a name, or the user's own; Hurle's by default."""
+    if given == MENISCI[1]:
+        from cz_gym.physics.young_laplace import YOUNG_LAPLACE  # it reads tables that are seldom needed
 
-    return YOUNG_LAPLACE
+        return YOUNG_LAPLACE
+    shape = HURLE if given is None or given == HURLE.name else given
+    if not isinstance(shape, MeniscusModel):
+        raise CzError(f"meniscus must be a cz_gym.MeniscusModel, not {given!r}")
+    return shape
+
+
+def _whole_steps(horizon: Any, interval: float) -> float:
+    """The horizon [s], checked to be a whole number of control intervals."""
+    length = positive("horizon", horizon)
+    steps = length / interval
+    if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:
+        raise CzError(f"horizon {length:g} s must be a whole number of control intervals of {interval:g} s")
+    return length
 
 
 def as_json(value: Any) -> Any:
@@ -248,24 +254,12 @@ def as_json(value: Any) -> Any:
     A scenario becomes a dict of its name and of its numbers off their defaults, a mixture one of its scenarios and
     their shares, a puller the text of its file. A process or a meniscus of the user's own stays as it is.
     """
-    if isinstance(value, Scenario):
-        numbers: dict[str, Any] = {"name": value.name, "series": as_json(value.series)} if value.series else {}
-        for family, each, number in value.members:
-            if number != each.default:
-                numbers.setdefault(family, {})[each.name] = as_json(number)
-        return {"name": value.name, **numbers}
-    if isinstance(value, Mixture):
-        return {"scenarios": as_json(value.scenarios), "shares": list(value.shares)}
+    if isinstance(value, Scenario | Mixture | MeniscusModel | Process | PullerFile):
+        return _own_as_json(value)
     if isinstance(value, Mapping):
         if all(isinstance(key, str) for key in value):
             return {str(key): as_json(each) for key, each in value.items()}
         return as_json(find_distribution(value))
-    if isinstance(value, MeniscusModel):
-        return value.name if value.name in MENISCI and _find_meniscus(value.name) == value else value
-    if isinstance(value, Process):
-        return value.name if ENVIRONMENTS.get(value.name) == value else value
-    if isinstance(value, PullerFile):
-        return to_toml(value)
     if isinstance(value, Path | Enum):
         return str(value) if isinstance(value, Path) else value.value
     if hasattr(value, "_asdict"):
@@ -273,6 +267,24 @@ def as_json(value: Any) -> Any:
     if isinstance(value, tuple | list | np.ndarray):
         return [as_json(each) for each in value]
     return value.item() if isinstance(value, np.generic) else value
+
+
+def _own_as_json(value: Any) -> Any:
+    """A record of this package as JSON (:func:`as_json`)."""
+    match value:
+        case Scenario():
+            numbers: dict[str, Any] = {"name": value.name, "series": as_json(value.series)} if value.series else {}
+            for family, each, number in value.members:
+                if number != each.default:
+                    numbers.setdefault(family, {})[each.name] = as_json(number)
+            return {"name": value.name, **numbers}
+        case Mixture():
+            return {"scenarios": as_json(value.scenarios), "shares": list(value.shares)}
+        case MeniscusModel():
+            return value.name if value.name in MENISCI and _find_meniscus(value.name) == value else value
+        case Process():
+            return value.name if ENVIRONMENTS.get(value.name) == value else value
+    return to_toml(value)
 
 
 def _scenario_of(given: Any) -> Any:

@@ -52,6 +52,7 @@ CACHE_VARIABLE = "CZ_GYM_CACHE_DIR"
 """Environment variable naming the folder for compiled code; empty means: keep none."""
 NEVER_COMPILED = (
     "agents", "baselines", "evaluation", "puller/shipped", "rendering", "sb3.py", "support/command_line.py", "tools",
+    "vector_checker.py",
 )  # fmt: skip
 """Parts of the package of which nothing is compiled in; all others count, whatever they hold."""
 FunctionCache: Any = caching.FunctionCache

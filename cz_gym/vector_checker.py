@@ -1,8 +1,9 @@
 """A checker of vector environments: ``cz_gym.check_vector_env`` compares one with a vector of its scalar form.
 
 It takes any of Gymnasium's vector environments, not this package's alone. Slot i with seed ``seeds[i]`` must equal the
-scalar form with that seed: spaces, observations, rewards, ends, infos and autoreset. Returned arrays must never be
-written or read again. The first difference is told in one line.
+scalar form with that seed: spaces, observations, rewards, ends, infos and autoreset. A vector that takes one seed
+alone, as Gymnasium's own native ones do, must instead repeat itself. Returned arrays must never be written or read
+again. The first difference is told in one line.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -44,6 +45,8 @@ class Driver:
     mode: AutoresetMode
     infos: bool = True
     rtol: float = 0.0
+    by_slot: bool = True
+    """Each slot is compared with the scalar form; False for a vector that takes no list of seeds."""
     episodes: int = 0
     failures: int = 0
     held: int = 0
@@ -56,6 +59,10 @@ class Driver:
     def vector(self) -> Any:
         """A new native form, as a context."""
         return closing(self.make_vector(self.num_envs, self.mode))
+
+    def scalars(self) -> Any:
+        """A new vector of the scalar form, as a context."""
+        return closing(SyncVectorEnv([self.make_scalar] * self.num_envs, autoreset_mode=self.mode))
 
     def require(self, fact: Any, message: str) -> None:
         """Raise :class:`NotConforming` unless the fact is true."""
@@ -74,7 +81,7 @@ class Driver:
         """Reset and step with sampled actions, which ``overwrites`` spoils; if ``DISABLED``, reset ended slots."""
         env.action_space.seed(self.seed)
         over, none = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.bool_)
-        yield Event("reset", self.begin(env, self.seeds), ~none)
+        yield self.event("reset", self.begin(env, self.seeds if self.by_slot else self.seed), ~none)
         for k in range(self.steps):
             action = env.action_space.sample()
             given = [(array.value, array.value.copy()) for array in flatten(action)]
@@ -87,12 +94,25 @@ class Driver:
             self.failures += counts * int(np.sum(result[2]))
             begun = {AutoresetMode.NEXT_STEP: over, AutoresetMode.SAME_STEP: ended}.get(self.mode, none)
             over = ended.copy()
-            yield Event(f"step {k}", result, begun.copy())
+            yield self.event(f"step {k}", result, begun.copy())
             if self.mode == AutoresetMode.DISABLED and over.any():
                 mask = over.copy()
                 again = env.reset(options={"reset_mask": mask})
                 mask[:] = True
-                yield Event(f"reset of ended slots after step {k}", again, over)
+                yield self.event(f"reset of ended slots after step {k}", again, over)
+
+    def event(self, call: str, result: tuple[Any, ...], first: Any) -> Event:
+        """An event, without the infos unless they are compared."""
+        return Event(call, result if self.infos else (*result[:-1], {}), first)
+
+    def takes_lists(self) -> bool:
+        """True if the native form takes a seed for each slot; Gymnasium asks for a whole number alone."""
+        with self.vector() as env:
+            try:
+                env.reset(seed=self.seeds)
+            except (TypeError, ValueError, AssertionError, gym.error.Error):
+                return False
+        return True
 
 
 def check_vector_env(
@@ -111,13 +131,20 @@ def check_vector_env(
 
     ``make_vector(num_envs, mode)`` makes the vector environment, ``make_scalar()`` the environment that each slot must
     equal. ``steps`` batched steps with sampled actions must end episodes (give a short horizon). ``random_start`` says
-    whether first observations of different episodes differ, ``infos`` whether infos are compared too, ``rtol`` by how
-    much, relative to them, numbers may differ: 0 means bit for bit.
+    whether first observations of different episodes differ, ``infos`` whether infos are looked at too, ``rtol`` by how
+    much, relative to them, numbers may differ: 0 means bit for bit. The result's ``by_slot`` says whether slots were
+    compared with scalars.
     """
     driver = Driver(make_vector, make_scalar, num_envs, steps, seed, mode, infos, rtol)
     _check_spaces(driver)
-    _check_seeds(driver, random_start)
-    _check_equality(driver, random_start)
+    driver.by_slot = driver.takes_lists()
+    try:
+        _check_seeds(driver, random_start)
+        _check_equality(driver, random_start)
+    except NotConforming:
+        if driver.by_slot:
+            _check_scalar(driver)
+        raise
     _check_kept(driver)
     _check_writes(driver)
     return driver
@@ -151,7 +178,7 @@ def _check_seeds(driver: Driver, random_start: bool) -> None:
             driver.require(again, f"seed {seed} gives another first observation in {what}")
         unseeded = _first(driver, None, env)
     seeds = [seed + 7 * (n - i) for i in range(n)]
-    for i, slot in enumerate(_first(driver, seeds)):
+    for i, slot in enumerate(_first(driver, seeds) if driver.by_slot else ()):
         with closing(driver.make_scalar()) as scalar:
             differs = difference(flatten(slot), flatten(scalar.reset(seed=seeds[i])[0]), rtol=driver.rtol)
         driver.require(not differs, f"seed list: slot {i} with seed {seeds[i]} differs from the scalar with that seed")
@@ -165,24 +192,33 @@ def _check_seeds(driver: Driver, random_start: bool) -> None:
         driver.require(not data_equivalence(one, other, exact=True), message)
 
 
+def _check_scalar(driver: Driver) -> None:
+    """Nothing can be compared with a scalar form that does not repeat itself."""
+    with driver.scalars() as first, driver.scalars() as second:
+        for one, other in zip(driver.run(first), driver.run(second), strict=True):
+            found = difference(flatten(one.result, "result"), flatten(other.result, "result"), True, driver.rtol)
+            driver.require(not found, f"{one.call}: the scalar form differs from itself with the same seed: {found}")
+
+
 def _check_equality(driver: Driver, random_start: bool) -> None:
-    """Every result equals the scalars', and every episode of a slot has a first observation of its own."""
+    """Every result equals the scalars', and every episode of a slot has a first observation of its own.
+
+    Without a seed for each slot a second native form stands in for the scalars.
+    """
     begun: list[list[Any]] = [[] for _ in range(driver.num_envs)]
-    scalars = closing(SyncVectorEnv([driver.make_scalar] * driver.num_envs, autoreset_mode=driver.mode))
-    with driver.vector() as env, scalars as oracle:
+    against = "native and scalar" if driver.by_slot else "two vectors with one seed"
+    with driver.vector() as env, driver.scalars() if driver.by_slot else driver.vector() as oracle:
         for one, other in zip(driver.run(env, counts=True), driver.run(oracle), strict=True):
             slots = list(iterate(env.observation_space, one.result[0]))
             for i in np.flatnonzero(one.first).tolist() if random_start else ():
                 again = any(data_equivalence(slots[i], old, exact=True) for old in begun[i])
                 driver.require(not again, f"{one.call}: slot {i} begins again with a first observation it had before")
                 begun[i].append(deepcopy(slots[i]))
-            driver.require(one.call == other.call, f"{one.call} where the scalars have {other.call}")
+            driver.require(one.call == other.call, f"{one.call} where the other has {other.call} ({against})")
             names = RESULT if len(one.result) == 5 else (RESULT[0], RESULT[-1])
             for name, ours, theirs in zip(names, one.result, other.result, strict=True):
-                if name == "info" and not driver.infos:
-                    continue
                 found = difference(flatten(ours, name), flatten(theirs, name), name == "info", driver.rtol)
-                driver.require(not found, f"{one.call}: {found} (native and scalar)")
+                driver.require(not found, f"{one.call}: {found} ({against})")
     driver.require(driver.episodes, f"no episode ended in {driver.steps} steps: give more, or a shorter horizon")
 
 
@@ -217,16 +253,18 @@ class NamedArray(NamedTuple):
 def flatten(value: Any, name: str = "") -> list[NamedArray]:
     """The arrays of nested mappings, sequences and object arrays, in order; those of an info with its mask."""
     if isinstance(value, dict):
-        found = []
-        for key in sorted(value, key=str):
-            by_slot = isinstance(value[key], dict) or np.asarray(value[key]).dtype != object
-            mask = value.get(f"_{key}") if isinstance(key, str) and by_slot else None
-            for array in flatten(value[key], f"{name}[{key!r}]" if name else str(key)):
-                found.append(array if array.mask is not None or mask is None else array._replace(mask=mask))
-        return found
+        return [array for key in sorted(value, key=str) for array in _flatten_key(value, key, name)]
     if isinstance(value, tuple | list) or (isinstance(value, np.ndarray) and value.dtype == object and value.ndim > 0):
         return [array for i, part in enumerate(value) if part is not None for array in flatten(part, f"{name}[{i}]")]
     return [NamedArray(name, value if isinstance(value, np.ndarray) else np.asarray(value))]
+
+
+def _flatten_key(value: dict[Any, Any], key: Any, name: str) -> list[NamedArray]:
+    """The arrays of a mapping's key, those of an info with the mask of its slots."""
+    by_slot = isinstance(value[key], dict) or np.asarray(value[key]).dtype != object
+    mask = value.get(f"_{key}") if isinstance(key, str) and by_slot else None
+    found = flatten(value[key], f"{name}[{key!r}]" if name else str(key))
+    return [array if array.mask is not None or mask is None else array._replace(mask=mask) for array in found]
 
 
 def difference(
@@ -240,15 +278,21 @@ def difference(
     for (name, a, _), (_, b, mask) in zip(one, other, strict=True):
         if a.shape != b.shape or (a.dtype != b.dtype and (not masked or b.dtype == np.bool_)):
             return f"{name} is {a.dtype} {a.shape} and {b.dtype} {b.shape}"
-        unlike = np.asarray((a != b) & ((a == a) | (b == b)))  # NaN is like NaN
-        if rtol and a.dtype.kind == "f":
-            unlike &= ~np.isclose(a, b, rtol=rtol, atol=rtol, equal_nan=True)
-        if masked and mask is not None and a.ndim > 0 and mask.shape == a.shape[:1]:
-            unlike &= mask.reshape(-1, *[1] * (a.ndim - 1))
+        unlike = _unlike(a, b, mask if masked else None, rtol)
         if unlike.any():
             at = tuple(int(i) for i in np.argwhere(unlike)[0])
             return f"{name}{f' of slot {at[0]}' if at else ''} is {a[at]} and {b[at]}"
     return None
+
+
+def _unlike(a: Any, b: Any, mask: Any, rtol: float) -> Any:
+    """Where two arrays of one shape differ, bool of that shape; NaN is like NaN."""
+    unlike = np.asarray((a != b) & ((a == a) | (b == b)))
+    if rtol and a.dtype.kind == "f":
+        unlike &= ~np.isclose(a, b, rtol=rtol, atol=rtol, equal_nan=True)
+    if mask is not None and a.ndim > 0 and mask.shape == a.shape[:1]:
+        unlike &= mask.reshape(-1, *[1] * (a.ndim - 1))
+    return unlike
 
 
 def overwrite(value: Any) -> None:

@@ -61,17 +61,24 @@ def read_numbers(text: str) -> tuple[Any, dict[str, Any], tuple[str, ...]]:
     missing: list[str] = []
     for table, known in TABLES.items():
         given = content.get(table, {})
-        if not isinstance(given, Mapping):
-            raise CzError(f"{table} must be a table [{table}], not {given!r:.40}")
-        for key, value in given.items():
-            if key not in known:
-                raise CzError(_misplaced(table, key, known))
-            quantity, number = known[key], _read(value, known[key])
-            pair = quantity.drawn and not isinstance(number, tuple)
-            numbers[quantity.symbol] = (number, number) if pair else number
+        numbers |= _numbers_of(table, given, known)
         if table in content or table not in OPTIONAL:
             missing += [key for key in known if key not in given and table != "camera"]
     return content.get("name"), numbers, tuple(missing)
+
+
+def _numbers_of(table: str, given: Any, known: Mapping[str, Quantity]) -> dict[str, Any]:
+    """The numbers of a table, by symbol [SI units]."""
+    if not isinstance(given, Mapping):
+        raise CzError(f"{table} must be a table [{table}], not {given!r:.40}")
+    numbers: dict[str, Any] = {}
+    for key, value in given.items():
+        if key not in known:
+            raise CzError(_misplaced(table, key, known))
+        quantity, number = known[key], _read(value, known[key])
+        pair = quantity.drawn and not isinstance(number, tuple)
+        numbers[quantity.symbol] = (number, number) if pair else number
+    return numbers
 
 
 def write_numbers(name: str, numbers: Mapping[str, Any]) -> str:

@@ -164,12 +164,7 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
     known = [*(each.name for each in controllers), *(name for name in given if name not in shipped), *shipped]
     check_apart([*known, *(each.name for each in own)], "controller")
     wanted = wanted_names(arguments, cases, [*given] or ([] if arguments.puller else shipped))
-    for name in wanted:
-        if name not in known:
-            for env, task in TASKS.items():
-                if name in shipped_names(env) or name in [each.name for each in task.controllers()]:
-                    raise CzError(f"{name!r} is for {env}: add --env {env}")
-            raise CzError(unknown_name_message("controller", name, known, ", or all"))
+    check_known(wanted, known)
     chosen = [each for each in controllers if each.name in wanted]
     check_quick(chosen, arguments, cases)
     chosen += agents_of(given, shipped, wanted)
@@ -177,6 +172,16 @@ def contenders_of(arguments: argparse.Namespace, cases: Sequence[Case]) -> list[
     if not (chosen or own):
         raise CzError("no controller takes part: name some with --controllers")
     return [*chosen, *own]
+
+
+def check_known(wanted: Sequence[str], known: Sequence[str]) -> None:
+    """Raise CzError for the first wanted name that is not known; it says so where another environment has it."""
+    for name in wanted:
+        if name not in known:
+            for env, task in TASKS.items():
+                if name in shipped_names(env) or name in [each.name for each in task.controllers()]:
+                    raise CzError(f"{name!r} is for {env}: add --env {env}")
+            raise CzError(unknown_name_message("controller", name, known, ", or all"))
 
 
 def agents_of(given: Mapping[str, Contender], shipped: Sequence[str], wanted: Sequence[str]) -> list[Contender]:

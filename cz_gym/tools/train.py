@@ -177,7 +177,15 @@ def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tupl
     name = arguments.algo or {recipe.name: key for key, recipe in recipes.items()}.get(agents, agents)
     if name not in recipes:
         raise CzError(f"{name!r} is no recipe here: name one of {', '.join(recipes)} by --algo")
-    own = recipes[name]
+    recipe = _recipe_of(recipes[name], arguments, settings, saved.get("steps"))
+    chosen_puller(recipe.puller or None)
+    check_config(recipe.config)
+    _ = recipe.steps_before  # an agent that cannot be learned on is refused before the work
+    return recipe, saved.get("seed", 0) if arguments.seed is None else arguments.seed
+
+
+def _recipe_of(own: TrainingConfig, arguments: argparse.Namespace, settings: Any, steps: int | None) -> TrainingConfig:
+    """A recipe with a resumed run's settings and steps, and over them those of the command line."""
     fields = {each.name for each in dataclass_fields(own)} - {"name", "steps"}
     chosen = {field: _listed(settings[field], getattr(own, field)) for field in fields & settings.keys()}
     given = {"scenario": arguments.scenario, "puller": arguments.puller}
@@ -185,12 +193,7 @@ def _recipe_and_seed(arguments: argparse.Namespace, folders: list[Path]) -> tupl
     chosen |= dict(_setting(text, own) for text in arguments.set)
     if start := chosen.get("start"):
         chosen["start"] = str(Path(start).absolute() if Path(start).suffix == ".onnx" else shipped(start))
-    steps = arguments.steps or saved.get("steps") or own.steps
-    recipe = replace(own.with_steps(steps), **chosen)
-    chosen_puller(recipe.puller or None)
-    check_config(recipe.config)
-    _ = recipe.steps_before  # an agent that cannot be learned on is refused before the work
-    return recipe, saved.get("seed", 0) if arguments.seed is None else arguments.seed
+    return replace(own.with_steps(arguments.steps or steps or own.steps), **chosen)
 
 
 def _setting(text: str, recipe: TrainingConfig) -> tuple[str, Any]:

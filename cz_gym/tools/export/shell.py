@@ -97,6 +97,55 @@ class Controller(Protocol):
         """Pull speed [m/s] and heater power [W] above nominal, and the new memory."""
 
 
+class Takeover(NamedTuple):
+    """How far a takeover is at a sample, arrays of bool."""
+
+    unsure: Any
+    """The controller has not begun: the setpoints may have been read wrong."""
+    brings_back: Any
+    """The PID brings back what an operator left far from nominal."""
+    settles: Any
+    """The controller, or that PID, is sure from this sample on."""
+    corrects: Any
+    """Setpoints that the takeover read wrong are set right at this sample."""
+
+
+class Duty(NamedTuple):
+    """Who sets the drives at a sample, arrays of bool, and what that follows from, times [s]."""
+
+    fallback: Any
+    begins_far: Any
+    returns: Any
+    """The controller takes over again from the fallback."""
+    mismatch: Any
+    confused: Any
+    """The controller's model does not explain the readings, so its memory begins anew."""
+    beyond: Any
+    """The radius is beyond its limit."""
+    authority: Any
+    """Share of the way from the applied drives to the controller's setpoints [-]."""
+    since_takeover: Any
+    bad_readings_time: Any
+    no_pyrometer_time: Any
+    settled_time: Any
+    good_time: Any
+
+
+class Control(NamedTuple):
+    """Setpoints that are wanted of the drives [mm/min, kW], and the readings and memories behind them."""
+
+    read: Measured
+    nominal: tuple[Any, Any]
+    T_1_offset: Any
+    Q_H_offset: Any
+    own: Any
+    """Memory of the controller."""
+    pid: Any
+    """Memory of the fallback."""
+    pull: Any
+    heater: Any
+
+
 def step(controller: Controller, pid: Controller, constants: PullerConstants, given: Any, memory: Any) -> Any:
     """Take one sample: outputs, memory, whether a sample was due and whether another one is.
 
@@ -115,23 +164,94 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     drive_error_time = np.where(call.later, memory.drive_error_time, held_error)
     lost = drive_error_time > DRIVE_ERROR_TIME
     follows = runs & ~lost
-    fallen, wait = runs & (memory.fallback > 0.5), given["return_after_s"]
-    # Setpoints that a takeover read wrong are set right once, when that has shown; then the controller begins. The PID
-    # that brings back what an operator left far from nominal acts at once, where the slew rate makes that gradual.
-    takeover, unsure = given["takeover_s"], ~runs | (memory.unsure > 0.5)
-    gradual = drives[0].slew * (dt / MINUTE) <= FAR_PULL * drives[0].nominal
-    brings_back = fallen & unsure & (takeover > 0.0) & gradual
-    waited = memory.since_takeover + dt - np.where(brings_back, 1.0, 0.5) * takeover
-    arrived = drives[1].still | brings_back | (waited >= ARRIVAL_TIME)
-    settles = runs & unsure & (takeover > 0.0) & (waited >= 0.0) & arrived
-    corrects = settles & ~brings_back
+    takeover = _takeover(dt, drives, given, memory, runs)
     told_drives = {
-        name: np.where(runs, (each.told(follows, corrects) - given[nominal]) * unit, getattr(raw, name))
+        name: np.where(runs, (each.told(follows, takeover.corrects) - given[nominal]) * unit, getattr(raw, name))
         for each, (name, (_, nominal, _, unit)) in zip(drives, list(READINGS.items())[-2:], strict=True)
     }
     trusted = plausible._replace(v_p=plausible.v_p | follows, Q_H=plausible.Q_H | follows)
     seen = sample_of(constants, call, ~(automatic & before), given, memory, raw._replace(**told_drives), trusted)
     good = seen.ring.good & seen.reference & known
+    duty = _duty(controller, dt, call, given, memory, engaged, runs, good, raw, seen, takeover)
+    control = _control(controller, pid, constants, call, memory, drives, runs, seen, takeover, duty)
+
+    old = [np.where(runs, each.near(each.held, lost), each.applied) for each in drives]
+    bias = np.where(call.starts, 0.0, memory.pull_bias)
+    bias = bias + min(dt / PULL_BIAS_TIME, 1.0) * (seen.read.v_p / (drives[0].nominal * MM_PER_MIN) - bias)
+    wanted = _without_readings(controller, constants, call, memory, seen, duty, control, old[1], bias)
+    sound = finite(wanted[0]) & finite(wanted[1])
+    moves = [
+        each.move(start, np.where(sound, target, start), duty.authority, dt)
+        for each, start, target in zip(drives, old, wanted, strict=True)
+    ]
+    sides = [
+        np.where(runs, mean + min(dt / PULL_BIAS_TIME, 1.0) * (side - mean), 0.0)
+        for mean, (_, side) in zip((memory.pull_limited, memory.heater_limited), moves, strict=True)
+    ]
+    erring = runs & (drives[0].errs | drives[1].errs)
+    reading_error_time = np.where(erring, memory.reading_error_time + dt, 0.0)
+    radius_time = np.where(duty.beyond, memory.radius_time + dt, 0.0)
+    setpoints = [
+        np.where(call.due, np.where(engaged, each.near(value, lost), each.applied), each.held)
+        for each, (value, _) in zip(drives, moves, strict=True)
+    ]
+    bits = {
+        Alarm.RING: ~seen.ring.good, Alarm.PYROMETER: ~seen.pyrometer, Alarm.DRIVES: ~known,
+        Alarm.REFERENCE: ~seen.reference, Alarm.LATE: call.late, Alarm.CLOCK: ~call.sound,
+        Alarm.PULL_LIMITED: np.abs(sides[0]) > LIMITED, Alarm.HEATER_LIMITED: np.abs(sides[1]) > LIMITED,
+        Alarm.TAKEOVER: engaged & ((duty.authority < 1.0) | (duty.since_takeover < given["takeover_s"])),
+        Alarm.FALLBACK: duty.fallback, Alarm.FAILED: engaged & ~sound,
+        Alarm.MANUAL: ~engaged, Alarm.SETTINGS: ~sane, Alarm.ASTRAY: lost, Alarm.MODEL: duty.mismatch,
+        Alarm.READING_ERROR: reading_error_time > READING_ERROR_TIME, Alarm.RING_STEP: seen.ring.stepped,
+        Alarm.RADIUS: radius_time > given["radius_limit_s"],
+    }  # fmt: skip
+    alarms = reduce(add, (np.where(holds, float(bit), 0.0) for bit, holds in bits.items()))
+    errors = (np.where(runs, each.error, 0.0) for each in drives)
+    outputs = dict(zip((port.name for port in OUTPUTS), (*setpoints, alarms, *errors), strict=True))
+    failed = engaged & ~sound
+    stays = np.where(duty.fallback & ((memory.stays > 0.5) | duty.mismatch) | failed, 1.0, 0.0)
+    pace = np.where(good & seen.pyrometer & ~duty.fallback, min(dt / LEVEL_TIME, 1.0), 0.0)
+    level = memory.T_1_level + pace * (control.read.T_1 - control.read.T_1_ref - memory.T_1_level)
+    level = np.where(runs & (stays < 0.5), level, 0.0)
+    now = Memory(
+        clock_s=call.clock, called_s=given["time_s"], late=np.where(call.late, 1.0, 0.0), samples=call.samples,
+        engaged=np.where(engaged, 1.0, 0.0), since_takeover=duty.since_takeover,
+        bad_readings_time=duty.bad_readings_time,
+        fallback=np.where(duty.fallback | duty.begins_far | failed, 1.0, 0.0), pull=setpoints[0],
+        heater=setpoints[1], drive_error_time=drive_error_time, last_T_1=seen.last_T_1,
+        frozen_time=seen.frozen_time, no_pyrometer_time=duty.no_pyrometer_time, pull_bias=bias,
+        settled_time=duty.settled_time, T_1_offset=control.T_1_offset, Q_H_offset=control.Q_H_offset, T_1_level=level,
+        unsure=np.where(takeover.unsure & ~takeover.settles, 1.0, 0.0),
+        sent_pull=drives[0].sent, sent_heater=drives[1].sent,
+        pull_difference=drives[0].difference, heater_difference=drives[1].difference,
+        reading_error_time=reading_error_time, pull_limited=sides[0], heater_limited=sides[1],
+        good_time=duty.good_time, stays=stays, last_ring=seen.ring.last, ring_still_time=seen.ring.still_time,
+        no_ring_time=seen.ring.gone_time, ring_level=seen.ring.level, ring_offset=seen.ring.offset,
+        ring_step=seen.ring.step, ring_step_time=seen.ring.step_time, radius_time=radius_time,
+        readings=seen.read, controller=control.own, pid=control.pid,
+    )  # fmt: skip
+    return outputs, now, call.due, call.again
+
+
+def _takeover(dt: float, drives: Any, given: Any, memory: Any, runs: Any) -> Takeover:
+    """Setpoints that a takeover read wrong are set right once, when that has shown; then the controller begins. The PID
+    that brings back what an operator left far from nominal acts at once, where the slew rate makes that gradual.
+    """
+    fallen, takeover, unsure = runs & (memory.fallback > 0.5), given["takeover_s"], ~runs | (memory.unsure > 0.5)
+    gradual = drives[0].slew * (dt / MINUTE) <= FAR_PULL * drives[0].nominal
+    brings_back = fallen & unsure & (takeover > 0.0) & gradual
+    waited = memory.since_takeover + dt - np.where(brings_back, 1.0, 0.5) * takeover
+    arrived = drives[1].still | brings_back | (waited >= ARRIVAL_TIME)
+    settles = runs & unsure & (takeover > 0.0) & (waited >= 0.0) & arrived
+    return Takeover(unsure, brings_back, settles, settles & ~brings_back)
+
+
+def _duty(
+    controller: Any, dt: float, call: Any, given: Any, memory: Any, engaged: Any, runs: Any, good: Any, raw: Any,
+    seen: Any, takeover: Takeover,
+) -> Duty:  # fmt: skip
+    """Who sets the drives, from readings that are ``good``, from the radius and from the pull speed."""
+    fallen, wait = runs & (memory.fallback > 0.5), given["return_after_s"]
     bad_readings_time = np.where(good, 0.0, np.where(call.starts, 0.0, memory.bad_readings_time) + dt)
     no_pyrometer_time = np.where(seen.pyrometer, 0.0, np.where(call.starts, 0.0, memory.no_pyrometer_time) + dt)
     settled_time = np.where(runs & seen.pyrometer & (memory.fallback < 0.5), memory.settled_time + dt, 0.0)
@@ -148,95 +268,67 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
     begins_far = engaged & ~runs & far & (wait > 0.0)
     returns = fallen & (memory.stays < 0.5) & (wait > 0.0) & (good_time >= wait)
     fallback = runs & ~returns & (fallen | (bad_readings_time > given["fallback_after_s"]) | mismatch)
-    since_takeover = np.where(fallback & ~fallen | returns | corrects, 0.5 * takeover, memory.since_takeover + dt)
+    length, begins = given["takeover_s"], fallback & ~fallen | returns | takeover.corrects
+    since_takeover = np.where(begins, 0.5 * length, memory.since_takeover + dt)
     since_takeover = np.where(runs, since_takeover, 0.0)
-    authority = np.clip(2.0 * since_takeover / np.maximum(takeover, 1e-3) - 1.0, 0.0, 1.0)
-    authority = np.where(brings_back, 1.0, np.where(unsure & (takeover > 0.0), 0.0, authority))
+    authority = np.clip(2.0 * since_takeover / np.maximum(length, 1e-3) - 1.0, 0.0, 1.0)
+    authority = np.where(takeover.brings_back, 1.0, np.where(takeover.unsure & (length > 0.0), 0.0, authority))
+    return Duty(
+        *(fallback, begins_far, returns, mismatch, confused, beyond, authority, since_takeover),
+        *(bad_readings_time, no_pyrometer_time, settled_time, good_time),
+    )
 
-    # Errors of the nominal values, as the takeover finds them, are taken off all later readings.
+
+def _control(
+    controller: Any, pid: Any, constants: PullerConstants, call: Any, memory: Any, drives: Any, runs: Any, seen: Any,
+    takeover: Takeover, duty: Duty,
+) -> Control:  # fmt: skip
+    """The controller and the fallback on the same readings. Errors of the nominal values, as the takeover finds them,
+    are taken off all later readings.
+    """
+    brings_back, corrects, fallen = takeover.brings_back, takeover.corrects, runs & (memory.fallback > 0.5)
     at_takeover = np.where(seen.pyrometer, _excess(seen.read.T_1, TRIM_T_1), 0.0)
     T_1_offset = np.where(runs, memory.T_1_offset, at_takeover)
     Q_H_offset = np.where(runs & ~corrects, memory.Q_H_offset, _excess(seen.read.Q_H, TRIM_Q_H * constants.ranges[1]))
     temperatures = {n: getattr(seen.read, n) - T_1_offset for n in Measured._fields if n.startswith("T_1")}
     read = seen.read._replace(**temperatures, Q_H=seen.read.Q_H - Q_H_offset)
     nominal = drives[0].nominal, drives[1].nominal + Q_H_offset / KILO
-    estimates = controller.accepts_missing_temperature
     # The samples of a call have one frame in common, whose noise counts once.
     told = read._replace(T_1=np.where(call.again, np.inf, seen.T_1 - T_1_offset), valid=read.valid / call.samples)
-    observes = controller.observes
-    goes_on = runs & ~corrects & ~confused & (True if observes else ~returns)
+    goes_on = runs & ~corrects & ~duty.confused & (True if controller.observes else ~duty.returns)
     held = memory.controller if goes_on.all() else select(goes_on, memory.controller, controller.at_rest(read))
-    own = controller.step(told if estimates else read, held)
+    own = controller.step(told if controller.accepts_missing_temperature else read, held)
     other = own[0], own[1], memory.pid
-    if (fallback | ~(finite(own[0]) & finite(own[1]))).any():
+    if (duty.fallback | ~(finite(own[0]) & finite(own[1]))).any():
         # Its heater makes the mean pull nominal: the operator's, as its integral, would stand in the radius for hours.
         begun = pid.at_rest(read._replace(v_p=np.where(brings_back, 0.0, read.v_p)))
         acts = fallen & ((memory.unsure < 0.5) | (brings_back & (memory.since_takeover > 0.0)))
         # Nor does it know by how much the heater is warmer than the recipe for that pull; the last minutes do.
         other = pid.step(read._replace(T_1=read.T_1 - memory.T_1_level), select(acts, memory.pid, begun))
     pull, heater = (
-        np.where(fallback, second, first) / unit + at
+        np.where(duty.fallback, second, first) / unit + at
         for first, second, unit, at in zip(own[:2], other[:2], (MM_PER_MIN, KILO), nominal, strict=True)
     )
+    return Control(read, nominal, T_1_offset, Q_H_offset, own[2], other[2], pull, heater)
 
-    old = [np.where(runs, each.near(each.held, lost), each.applied) for each in drives]
-    bias = np.where(call.starts, 0.0, memory.pull_bias)
-    bias = bias + min(dt / PULL_BIAS_TIME, 1.0) * (seen.read.v_p / (drives[0].nominal * MM_PER_MIN) - bias)
-    blind = ~seen.pyrometer & ((no_pyrometer_time > NO_PYROMETER_TIME) | fallback | (not estimates))
+
+def _without_readings(
+    controller: Any, constants: PullerConstants, call: Any, memory: Any, seen: Any, duty: Duty, control: Control,
+    old_heater: Any, bias: Any,
+) -> tuple[Any, Any]:  # fmt: skip
+    """The wanted setpoints, with the nominal pull speed where no ring is seen, and a heater that follows the recipe and
+    the mean pull speed where no temperature is.
+    """
+    estimates, dt = controller.accepts_missing_temperature, constants.dt
+    blind = ~seen.pyrometer & ((duty.no_pyrometer_time > NO_PYROMETER_TIME) | duty.fallback | (not estimates))
     moved = np.where(seen.reference & ~call.starts, seen.read.T_1_ref - memory.readings.T_1_ref, 0.0)
     trim = FOLLOWED * constants.feed * moved + constants.trim * (bias - memory.pull_bias + dt / constants.slow * bias)
     # Any other pull than the mean one grows into the radius unseen, and the last one is none.
-    no_ring = ~seen.ring.good & (fallback | (False if observes else memory.no_ring_time > NO_RING_TIME))
-    wanted = np.where(no_ring, nominal[0], pull), np.where(blind, old[1] + trim / KILO, heater)
-    sound = finite(wanted[0]) & finite(wanted[1])
-    moves = [
-        each.move(start, np.where(sound, target, start), authority, dt)
-        for each, start, target in zip(drives, old, wanted, strict=True)
-    ]
-    sides = [
-        np.where(runs, mean + min(dt / PULL_BIAS_TIME, 1.0) * (side - mean), 0.0)
-        for mean, (_, side) in zip((memory.pull_limited, memory.heater_limited), moves, strict=True)
-    ]
-    erring = runs & (drives[0].errs | drives[1].errs)
-    reading_error_time = np.where(erring, memory.reading_error_time + dt, 0.0)
-    radius_time = np.where(beyond, memory.radius_time + dt, 0.0)
-    setpoints = [
-        np.where(call.due, np.where(engaged, each.near(value, lost), each.applied), each.held)
-        for each, (value, _) in zip(drives, moves, strict=True)
-    ]
-    bits = {
-        Alarm.RING: ~seen.ring.good, Alarm.PYROMETER: ~seen.pyrometer, Alarm.DRIVES: ~known,
-        Alarm.REFERENCE: ~seen.reference, Alarm.LATE: call.late, Alarm.CLOCK: ~call.sound,
-        Alarm.PULL_LIMITED: np.abs(sides[0]) > LIMITED, Alarm.HEATER_LIMITED: np.abs(sides[1]) > LIMITED,
-        Alarm.TAKEOVER: engaged & ((authority < 1.0) | (since_takeover < takeover)),
-        Alarm.FALLBACK: fallback, Alarm.FAILED: engaged & ~sound,
-        Alarm.MANUAL: ~engaged, Alarm.SETTINGS: ~sane, Alarm.ASTRAY: lost, Alarm.MODEL: mismatch,
-        Alarm.READING_ERROR: reading_error_time > READING_ERROR_TIME, Alarm.RING_STEP: seen.ring.stepped,
-        Alarm.RADIUS: radius_time > given["radius_limit_s"],
-    }  # fmt: skip
-    alarms = reduce(add, (np.where(holds, float(bit), 0.0) for bit, holds in bits.items()))
-    errors = (np.where(runs, each.error, 0.0) for each in drives)
-    outputs = dict(zip((port.name for port in OUTPUTS), (*setpoints, alarms, *errors), strict=True))
-    stays = np.where(fallback & ((memory.stays > 0.5) | mismatch) | (engaged & ~sound), 1.0, 0.0)
-    pace = np.where(good & seen.pyrometer & ~fallback, min(dt / LEVEL_TIME, 1.0), 0.0)
-    level = memory.T_1_level + pace * (read.T_1 - read.T_1_ref - memory.T_1_level)
-    level = np.where(runs & (stays < 0.5), level, 0.0)
-    now = Memory(
-        clock_s=call.clock, called_s=given["time_s"], late=np.where(call.late, 1.0, 0.0), samples=call.samples,
-        engaged=np.where(engaged, 1.0, 0.0), since_takeover=since_takeover, bad_readings_time=bad_readings_time,
-        fallback=np.where(fallback | begins_far | (engaged & ~sound), 1.0, 0.0), pull=setpoints[0],
-        heater=setpoints[1], drive_error_time=drive_error_time, last_T_1=seen.last_T_1,
-        frozen_time=seen.frozen_time, no_pyrometer_time=no_pyrometer_time, pull_bias=bias,
-        settled_time=settled_time, T_1_offset=T_1_offset, Q_H_offset=Q_H_offset, T_1_level=level,
-        unsure=np.where(unsure & ~settles, 1.0, 0.0), sent_pull=drives[0].sent, sent_heater=drives[1].sent,
-        pull_difference=drives[0].difference, heater_difference=drives[1].difference,
-        reading_error_time=reading_error_time, pull_limited=sides[0], heater_limited=sides[1],
-        good_time=good_time, stays=stays, last_ring=seen.ring.last, ring_still_time=seen.ring.still_time,
-        no_ring_time=seen.ring.gone_time, ring_level=seen.ring.level, ring_offset=seen.ring.offset,
-        ring_step=seen.ring.step, ring_step_time=seen.ring.step_time, radius_time=radius_time,
-        readings=seen.read, controller=own[2], pid=other[2],
-    )  # fmt: skip
-    return outputs, now, call.due, call.again
+    no_ring_time = False if controller.observes else memory.no_ring_time > NO_RING_TIME
+    no_ring = ~seen.ring.good & (duty.fallback | no_ring_time)
+    return np.where(no_ring, control.nominal[0], control.pull), np.where(
+        blind, old_heater + trim / KILO, control.heater
+    )
 
 
 def _excess(value: Any, most: float) -> Any:
