@@ -184,7 +184,7 @@ class TrainingRun:
     @property
     def steps(self) -> int:
         """Environment steps taken."""
-        return environment_steps(self.algorithm)
+        return int(self.algorithm.num_timesteps) * repeat_of(self.recipe)
 
     def train(self, bar: Any = None) -> dict[str, float]:
         """Train to the end, from the checkpoint if there is one; returns the content of ``summary.json``.

@@ -271,5 +271,8 @@ def environment_steps(model: BaseAlgorithm) -> int:
     if env is None:
         return int(model.num_timesteps)
     repeat = unwrap_vec_wrapper(env, ActionRepeat)
-    own = max(env.get_attr("action_repeat")) if env.has_attr("action_repeat") else 1
+    try:
+        own = env.get_attr("action_repeat", 0)[0]
+    except AttributeError:
+        own = 1
     return int(model.num_timesteps) * own * (1 if repeat is None else repeat.times)
