@@ -26,6 +26,7 @@ from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
+from cz_gym.sb3 import CzVecEnv
 from cz_gym.support.command_line import interpreter
 from cz_gym.tools import train
 from cz_gym.tools.registry import make_base, make_controller
@@ -321,6 +322,14 @@ def test_seeds_come_out_as_one_by_one_and_only_once(seeds, tmp_path, capsys):
     assert "seed4 holds a run already" in capsys.readouterr().err
     assert train.main(["--resume", "--seeds", "4-5", "--scenario", "hard", "--out", str(several)]) == 2
     assert "begun with another settings" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("seeds")
+def test_no_step_of_training_asks_every_slot(tmp_path, monkeypatch):
+    asked, own = [], CzVecEnv.get_attr
+    monkeypatch.setattr(CzVecEnv, "get_attr", lambda env, *some: asked.append(some) or own(env, *some))
+    assert train.main(["--algo", "ppo", "--out", str(tmp_path / "run")]) == 0
+    assert len(asked) < SMALL_PPO.steps // SMALL_PPO.num_envs // SMALL_PPO.action_repeat
 
 
 def test_an_unfinished_seed_goes_on_and_longer_runs_do_too(seeds, tmp_path, monkeypatch):
