@@ -106,6 +106,17 @@ def test_mass_dopant_and_energy_over_a_whole_crystal():
     assert at_interface(x, d, p, hurle_slope).deep * p.M_0 + x.M_s == pytest.approx(p.M_0, abs=1.0)
 
 
+@pytest.mark.parametrize("L", [0.03, 0.06, 0.2, 0.5, 0.9, 1.15, 1.22])
+def test_the_plant_moves_along_the_recipe_under_its_drives(L):
+    """The recipe is found backwards, from the shape to the drives; the plant's own equations must lead along it."""
+    p, table = nominal_recipe(DESIGN, HURLE)
+    x, (row, share), near = recipe.state_at(L, table, p, EPISODE), recipe.place(L, p), 5e-4
+    u = Inputs(*(float(recipe.look_up(table, row, share, at)) for at in (recipe._v_p, recipe._Q_H)))
+    moves = rates(x, u, Disturbance(0.0, 0.0), p, HURLE)
+    before, after = (np.array(recipe.state_at(L + side * near, table, p, EPISODE)) for side in (-1.0, 1.0))
+    np.testing.assert_allclose(moves, (after - before) / (2.0 * near) * moves.L, rtol=0.03, atol=1e-11)
+
+
 def test_rk4_converges_with_the_fourth_order_in_the_crown():
     p, table = nominal_recipe(DESIGN, HURLE)
     x, u, d = recipe.state_at(0.02, table, p, EPISODE), Inputs(2.4e-5, 5.6e4), Disturbance(200.0, 0.3)

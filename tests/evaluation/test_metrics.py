@@ -223,16 +223,23 @@ def margins(**changes):
     return relative_margin(at, LIMIT, make_config(process=CRYSTAL).parameters)
 
 
+class Stops:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.tile(np.array([-1.0, 0.0], np.float32), (len(observation), 1)), state
+
+
+@pytest.mark.parametrize(("stage", "part"), [(0.05, "crown"), (0.3, "body"), (1.15, "tail")])
+def test_a_crystal_is_lost_in_the_part_where_it_grew(stage, part):
+    config = make_config("randomized", observation="measured", action="direct", process=CRYSTAL, stage=stage)
+    m = crystal_metrics(rollout(Stops(), config, TEST_SEEDS[:3]))
+    found = {each: getattr(m, f"lost_in_{each}").tolist() for each in ("crown", "body", "tail")}
+    assert found == {each: [float(each == part)] * 3 for each in found}
+
+
 def test_a_frozen_crown_counts_once_and_with_the_largest_allowed_error():
     """With a pull speed that is much too low a crown freezes within minutes."""
-
-    class Stops:
-        def predict(self, observation, state=None, episode_start=None, deterministic=True):
-            return np.tile(np.array([-1.0, 0.0], np.float32), (len(observation), 1)), state
-
     config = make_config("randomized", observation="measured", action="direct", process=CRYSTAL, stage=0.05)
-    run = rollout(Stops(), config, TEST_SEEDS[:3])
-    m = crystal_metrics(run)
+    m = crystal_metrics(rollout(Stops(), config, TEST_SEEDS[:3]))
     for name, value in (("lost_in_crown", 1), ("frozen", 1), ("failure_rate", 1), ("completed", 0), ("detached", 0)):
         np.testing.assert_array_equal(getattr(m, name), value)
     np.testing.assert_array_equal(m.crown_max_mm, 12.0)
