@@ -98,7 +98,7 @@ STYLES = {
     "open-loop": _style(7, "pentagon"),
     "pid-uncompensated": _style(6, "cross"),
     "pid-conventional": _style(4, "bar"),
-    "paper-filtered": _style(3, "sun"),
+    "paper-filtered": _style(1, "sun")._replace(dashes=DASHES[6]),  # of one family with paper
     "lqg": _style(6, "bar"),
     "lqg-quiet": _style(7, "sun"),
     "lqg-at-0.02-adaptive": _style(0, "cross"),
