@@ -37,7 +37,7 @@ from .robustness import policy_and_config
 
 CONTROLLERS = ("paper", "paper-filtered", "paper-tuned", "lqg-at-0.02", "lqg-one-design", "gradient", "ppo", "sac",
                "ppo-plain")  # fmt: skip
-"""Controllers and agents of the README's table, an agent's first training seed, and the paper's with a filter."""
+"""Controllers and agents of the README's table, an agent by its seed of least validation cost, and the paper's with a filter."""
 FLUCTUATION, CAMERA, PYROMETER = 0.29, 0.029 * MM, 0.058
 """Root mean squares of each fluctuation [K], of the camera's [m] and of the pyrometer's noise [K] on ``randomized``."""
 FIXED = Scenario(
@@ -250,7 +250,7 @@ def _main(given: argparse.Namespace) -> None:
 
 Radius error (RMSE) [mm] on {given.crystals} test crystals of three hours, one estimate moved at a time; the controllers
 stay as they are on `randomized`. A lost crystal counts 8 mm to its end. Kendall's tau compares the order of the errors
-with that of the first row: 1 is the same order, 0 no relation. An agent is its first training seed.
+with that of the first row: 1 is the same order, 0 no relation. An agent is its training seed of least validation cost.
 
 {markdown(("estimate", "tau", *names, "lost"), ranked(moved))}
 
