@@ -37,7 +37,7 @@ from .robustness import policy_and_config
 
 CONTROLLERS = ("paper", "paper-filtered", "paper-tuned", "lqg-at-0.02", "lqg-one-design", "gradient", "ppo", "sac",
                "ppo-plain")  # fmt: skip
-"""Controllers and agents of the README's table, an agent by its seed of least validation cost, and the paper's with a filter."""
+"""Controllers of the README's table, the paper's with a filter, and agents by their seed of least validation cost."""
 FLUCTUATION, CAMERA, PYROMETER = 0.29, 0.029 * MM, 0.058
 """Root mean squares of each fluctuation [K], of the camera's [m] and of the pyrometer's noise [K] on ``randomized``."""
 FIXED = Scenario(
