@@ -232,9 +232,9 @@ def test_the_finding_tells_those_who_are_told_apart_and_says_how_much_each_moves
     ]  # fmt: skip
     assert finding(made(cases, *who)) == (
         "**Of the controllers that are not told which scenario they meet, the learned agent `agent` ranks first.** "
-        "The best classical controller of them is `free`. Cost counts the radius error and the moves of both drives. "
-        "Its mean is 0.2010 against 0.4020 on `randomized`, and 0.2010 against 0.4020 on `hard`. Of those told the "
-        "scenario, the best are `told` on `randomized` (0.1005) and `told` on `hard` (0.1005). On `randomized`, "
+        "The best classical controller of them is `free`. Their mean costs, of radius error and drive moves, are "
+        "0.2010 and 0.4020 on `randomized`, and 0.2010 and 0.4020 on `hard`. Of those that are told, and tuned for "
+        "each scenario, the best are `told` on `randomized` (0.1005) and `told` on `hard` (0.1005). On `randomized`, "
         "`agent`, `free` and `told` have a radius error of 0.800, 0.600 and 0.900 mm (RMSE). Their pull speed changes "
         "by 0.3000, 0.2000 and 0.5000 mm/min (RMS) from sample to sample. No learned agent lost a crystal."
     )

@@ -180,8 +180,8 @@ def finding(benchmark: Benchmark) -> str:
     kinds = ["learned agent" if each.learned else "classical controller" for each in (best, other)]
     return (
         f"**Of the controllers that are not told which scenario they meet, the {kinds[0]} `{best.name}` ranks first.** "
-        f"The best {kinds[1]} of them is `{other.name}`. Cost counts the radius error and the moves of both drives. "
-        f"Its mean is {', and '.join(pairs)}. Of those told the scenario, the best are "
+        f"The best {kinds[1]} of them is `{other.name}`. Their mean costs, of radius error and drive moves, are "
+        f"{', and '.join(pairs)}. Of those that are told, and tuned for each scenario, the best are "
         f"{' and '.join(aware)}. On `{cases[0].name}`, {three[0]} have a radius error of {three[1]} mm (RMSE). Their "
         f"pull speed changes by {three[2]} mm/min (RMS) from sample to sample. {_lost_by_agents(benchmark)}"
     )
@@ -204,7 +204,7 @@ def _against(benchmark: Benchmark, case: Case, best: Contender, other: Contender
     get: Any = benchmark.get
     ours, theirs = (get(case, each.name, cost.metric) for each in (best, other))
     near = "" if ours.ends[1] < theirs.ends[0] else " (intervals overlap)"
-    return f"{cost.text(ours)} against {cost.text(theirs)} on `{case.name}`{near}"
+    return f"{cost.text(ours)} and {cost.text(theirs)} on `{case.name}`{near}"
 
 
 def fill_in(page: str, benchmark: Benchmark) -> str:

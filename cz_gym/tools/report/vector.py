@@ -166,9 +166,9 @@ def result(benchmark: Benchmark) -> str:
 
 def _below(shown: Sequence[Contender], case: Case, crystals: int, y: float) -> tuple[list[str], float]:
     """Key and notes below the rows, which end at y [px], and the height of the picture [px]."""
-    told = "which scenario it meets" if any(each.told for each in shown) else "what no sensor shows"
+    told = "its scenario, tuned for it" if any(each.told for each in shown) else "what no sensor shows"
     hollow = any(is_told(each, case) for each in shown)
-    notes = ["mean of all crystals, lost ones included"]
+    notes = ["mean of all crystals, lost ones included", "ranks go by crystals lost, then by cost"]
     notes += [f"bars: 95 % intervals over {crystals} test crystals"] if crystals > 1 else []
     top = y + 84.0 + 28.0 * hollow
     parts = _key(y + 52.0, f"hollow: told {told}" if hollow else "", any(each.learned for each in shown))
@@ -196,7 +196,7 @@ def _row(axis: Axis, y: float, found: Estimate | None, share: Estimate | None, l
         return parts
     if not axis.holds(found.mean):
         often = f"{share.mean:.0%} lost, " if share and share.mean > OFTEN else ""
-        said = f"{often}{found.mean:.3g} →".replace("%", " %")
+        said = f"{often}{found.mean:.3g} mm →".replace("%", " %")
         return [*parts, text(axis.end, y + 5.0, said, "end", class_="faint", font_size="16")]
     low, high = found.ends
     return [*parts, bar(axis.at(low), y, axis.at(high), y, look), mark(axis.at(found.mean), y, look, told)]
@@ -249,7 +249,10 @@ def pareto(benchmark: Benchmark) -> str:
         parts += [mark(x, y, looks[each.name], is_told(each, cases[0]))]
         parts += [text(x + 14.0, y + 5.5, short(each.name), font_size="16")]
     height = top + -(-len(named) // ACROSS) * 28.0
-    for said in ("hollow: told which scenario it meets; grey: others", "bars: 95 % intervals; an arrow: further off"):
+    for said in (
+        "hollow: told its scenario, tuned for it; grey: others",
+        "bars: 95 % intervals; an arrow: further off",
+    ):
         parts += [text(12.0, height, said, class_="faint", font_size="16")]
         height += 24.0
     return svg(height - 8.0, parts, "Error against pull activity")
