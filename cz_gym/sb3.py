@@ -272,7 +272,7 @@ def environment_steps(model: BaseAlgorithm) -> int:
         return int(model.num_timesteps)
     repeat = unwrap_vec_wrapper(env, ActionRepeat)
     try:
-        own = env.get_attr("action_repeat", 0)[0]
+        own: int = env.get_attr("action_repeat", 0)[0]
     except AttributeError:
         own = 1
     return int(model.num_timesteps) * own * (1 if repeat is None else repeat.times)
