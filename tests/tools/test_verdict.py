@@ -244,7 +244,7 @@ def test_the_finding_tells_those_who_are_told_apart_and_says_how_much_each_moves
     who[3][1].pop("failure_rate")
     assert finding(made(cases, *who[1:])) == ""
     close = finding(made(cases, *who[:3], (who[3][0], steps(0.399, 0.3))))
-    assert "on `hard` (intervals overlap). Of those told" in close
+    assert "on `hard` (intervals overlap). Of those that are told" in close
 
 
 def test_the_plot_shows_all_whom_the_finding_names():
@@ -269,7 +269,7 @@ def test_the_plot_shows_pids_as_such_and_the_share_that_one_loses():
     who[1] = contender(vector.PIDS[0]), {"rmse_mm": [9.0] * 4, "failure_rate": [0.0, 1.0, 1.0, 0.0]}
     benchmark = made(find_case("randomized"), *who)
     words = [each.text for each in ElementTree.fromstring(vector.result(benchmark)).iter(f"{SVG}text")]
-    assert {"paper (PID)", *vector.PIDS, "50 % lost, 9 →"} <= {*words}
+    assert {"paper (PID)", *vector.PIDS, "50 % lost, 9 mm →"} <= {*words}
 
 
 def test_the_crystal_that_pictures_show_is_usual_for_every_controller():
