@@ -209,6 +209,8 @@ def _check_equality(driver: Driver, random_start: bool) -> None:
     against = "native and scalar" if driver.by_slot else "two vectors with one seed"
     with driver.vector() as env, driver.scalars() if driver.by_slot else driver.vector() as oracle:
         for one, other in zip(driver.run(env, counts=True), driver.run(oracle), strict=True):
+            fits = driver.by_slot or env.observation_space.contains(one.result[0])
+            driver.require(fits, f"{one.call}: the observation is not in observation_space")
             slots = list(iterate(env.observation_space, one.result[0]))
             for i in np.flatnonzero(one.first).tolist() if random_start else ():
                 again = any(data_equivalence(slots[i], old, exact=True) for old in begun[i])

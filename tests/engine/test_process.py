@@ -192,6 +192,7 @@ def test_the_batch_is_a_vector_of_scalars(mode, given):
     settings = {**given, "scenario": "all", "info": "all", "control_interval": 120.0, "horizon": 3600.0}
     make = lambda n, mode: CzVectorEnv(n, autoreset_mode=mode, **settings)  # noqa: E731
     checked = check_vector_env(make, lambda: CzEnv(**settings), mode=mode)
+    assert checked.by_slot
     assert checked.episodes > checked.failures > 4
 
 

@@ -15,6 +15,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Dict
 from gymnasium.utils.env_checker import check_env as check_with_gymnasium
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import TransformObservation
 from stable_baselines3.common.env_checker import check_env as check_with_sb3
 
 from cz_gym import SCENARIOS, CzEnv, CzVectorEnv
@@ -27,9 +28,11 @@ SHORT = {"control_interval": 60.0, "horizon": 1200.0}
 
 def conforming(settings, **options):
     """What a check of these settings counts; it raises where batch and scalars differ."""
-    return check_vector_env(
+    checked = check_vector_env(
         lambda n, mode: CzVectorEnv(n, autoreset_mode=mode, **settings), lambda: CzEnv(**settings), **options
     )
+    assert checked.by_slot
+    return checked
 
 
 @pytest.mark.parametrize("observation", ["measured", "history", "state"])
@@ -298,6 +301,13 @@ def test_vectors_of_others_pass_or_fail_for_good_reasons():
     assert (checked.by_slot, checked.failures > 9) == (True, True)
     checked = check_vector_env(lambda n, _: gym.make_vec("CartPole-v1", n, "vector_entry_point"), cart_pole)
     assert (checked.by_slot, checked.failures > 9) == (False, True)
+
+    def wider(n, _):
+        native = gym.make_vec("CartPole-v1", n, "vector_entry_point")
+        return TransformObservation(native, lambda shown: shown.astype(np.float64))
+
+    with pytest.raises(NotConforming, match=r"^\[NextStep\] reset: the observation is not in observation_space"):
+        check_vector_env(wider, cart_pole)
 
 
 def test_a_scalar_form_that_does_not_repeat_itself_is_named():

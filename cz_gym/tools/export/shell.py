@@ -100,6 +100,8 @@ class Controller(Protocol):
 class Takeover(NamedTuple):
     """How far a takeover is at a sample, arrays of bool."""
 
+    fallen: Any
+    """The fallback controlled at the last sample."""
     unsure: Any
     """The controller has not begun: the setpoints may have been read wrong."""
     brings_back: Any
@@ -243,7 +245,7 @@ def _takeover(dt: float, drives: Any, given: Any, memory: Any, runs: Any) -> Tak
     waited = memory.since_takeover + dt - np.where(brings_back, 1.0, 0.5) * takeover
     arrived = drives[1].still | brings_back | (waited >= ARRIVAL_TIME)
     settles = runs & unsure & (takeover > 0.0) & (waited >= 0.0) & arrived
-    return Takeover(unsure, brings_back, settles, settles & ~brings_back)
+    return Takeover(fallen, unsure, brings_back, settles, settles & ~brings_back)
 
 
 def _duty(
@@ -251,7 +253,7 @@ def _duty(
     seen: Any, takeover: Takeover,
 ) -> Duty:  # fmt: skip
     """Who sets the drives, from readings that are ``good``, from the radius and from the pull speed."""
-    fallen, wait = runs & (memory.fallback > 0.5), given["return_after_s"]
+    fallen, wait = takeover.fallen, given["return_after_s"]
     bad_readings_time = np.where(good, 0.0, np.where(call.starts, 0.0, memory.bad_readings_time) + dt)
     no_pyrometer_time = np.where(seen.pyrometer, 0.0, np.where(call.starts, 0.0, memory.no_pyrometer_time) + dt)
     settled_time = np.where(runs & seen.pyrometer & (memory.fallback < 0.5), memory.settled_time + dt, 0.0)
@@ -286,7 +288,7 @@ def _control(
     """The controller and the fallback on the same readings. Errors of the nominal values, as the takeover finds them,
     are taken off all later readings.
     """
-    brings_back, corrects, fallen = takeover.brings_back, takeover.corrects, runs & (memory.fallback > 0.5)
+    fallen, brings_back, corrects = takeover.fallen, takeover.brings_back, takeover.corrects
     at_takeover = np.where(seen.pyrometer, _excess(seen.read.T_1, TRIM_T_1), 0.0)
     T_1_offset = np.where(runs, memory.T_1_offset, at_takeover)
     Q_H_offset = np.where(runs & ~corrects, memory.Q_H_offset, _excess(seen.read.Q_H, TRIM_Q_H * constants.ranges[1]))
