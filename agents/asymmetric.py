@@ -3,7 +3,8 @@
 For a :class:`cz_gym.sb3.CzVecEnv` with ``critic_state``. Critics read the state; actors read an estimate of it, which
 the callback :class:`LearnState` fits by regression:
 ``PPO(AsymmetricPolicy, make_vec_env(1024, critic_state=True)).learn(steps, LearnState())``. ``predict`` takes the
-observations of the environment as it is. Needs stable-baselines3.
+observations of the environment as it is, and keeps the means over hours that the batch shows in a memory. Needs
+stable-baselines3.
 """
 
 from collections.abc import Sequence
@@ -21,8 +22,10 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 from torch.nn.functional import huber_loss
 
+from cz_gym.config import Config
 from cz_gym.crystal.process import ENVIRONMENTS
-from cz_gym.process import Channel
+from cz_gym.process import Channel, Process
+from cz_gym.sb3 import LongMeans, long_channels
 from cz_gym.spaces import observations
 from cz_gym.support.errors import CzError, require_type
 
@@ -33,45 +36,96 @@ GAINS = {
     "ring_offset": 8.0, "lam": 4.0, "v_p_mean": 2.0, "asked_v_p": 8.0, "asked_Q_H": 8.0,
 }  # fmt: skip
 """Factors that bring channels that vary little while a crystal is held to the order of 1; the others need none."""
+HARDLY_TOLD = {"r_c_error": 0.3, "dT_i": 0.5, "ring_offset": 0.3, "lam": 0.1}
+"""Weights of errors of the estimate that sensors can hardly make smaller, which would drown the others; else 1."""
 
 
 class Layout(NamedTuple):
     """The channels that an asymmetric policy is given."""
 
-    history: tuple[Channel, ...]
-    """Channels of "history", after those of :data:`cz_gym.agents.residual.ADDED` if the agent adds to a controller."""
-    state: tuple[Channel, ...]
+    process: Process
+    added: tuple[Channel, ...]
+    """Those of :data:`cz_gym.agents.residual.ADDED`, which come first, if the agent adds to a controller."""
     present: int
-    """Number of channels of "history" that show the present; the last one is the integral of the ring error."""
+    """Number of channels that show the present; the last one is the integral of the ring error."""
     unknown: list[int]
     """Places in the true state of what no sensor shows without error."""
+
+    @property
+    def sensed(self) -> tuple[Channel, ...]:
+        """Channels that the environment shows to the agent."""
+        return (*self.added, *observations(self.process)["history"])
+
+    @property
+    def seen(self) -> tuple[Channel, ...]:
+        """Channels that the actor reads: these, and the means over hours."""
+        return (*self.sensed, *long_channels(self.process))
+
+    @property
+    def state(self) -> tuple[Channel, ...]:
+        """The true state, which follows."""
+        return self.process.state
 
 
 @cache
 def layout(width: int) -> Layout:
     """Find the environment whose "history" and true state have that many channels; CzError if none has."""
     for process, added in product(ENVIRONMENTS.values(), ((), ADDED)):
-        history, state = (*added, *observations(process)["history"]), process.state
-        if width == len(history) + len(state):
-            unknown = [i for i, each in enumerate(state) if each not in process.measured]
-            return Layout(history, state, len(added) + len(process.measured) + 1, unknown)
+        unknown = [i for i, each in enumerate(process.state) if each not in process.measured]
+        known = Layout(process, added, len(added) + len(process.measured) + 1, unknown)
+        if width == len(known.seen) + len(known.state):
+            return known
     raise CzError("this policy is told the true state: make_vec_env(..., critic_state=True)")
 
 
 class Asymmetric(BasePolicy):
-    """A policy whose critic reads the plant's true state behind the channels of "history"."""
+    """A policy whose critic reads the plant's true state behind what its actor sees.
 
-    def __init__(self, observation_space: Any, *others: Any, **named: Any) -> None:
+    ``interval`` is the time between actions [s] of the environments that it acts in.
+    """
+
+    def __init__(self, observation_space: Any, *others: Any, interval: float = 5.0, **named: Any) -> None:
         self.width = observation_space.shape[-1]
-        self.channels = len(layout(self.width).history)
-        """Number of channels that the actor reads."""
+        known = layout(self.width)
+        self.channels = len(known.sensed)
+        """Number of channels that the environment shows."""
+        self.interval = interval
         super().__init__(observation_space, *others, **named)
+        self.means, self.added = LongMeans(known.process, interval), len(known.added)
 
-    def predict(self, observation: Any, *others: Any, **named: Any) -> Any:
-        """Act as stable-baselines3's policies do; the true state may be missing from the observation."""
-        missing = self.width - observation.shape[-1]
-        padding = ((0, 0),) * (observation.ndim - 1) + ((0, missing),)
-        return super().predict(np.pad(observation, padding), *others, **named)
+    def check_interval(self, config: Config) -> None:
+        """CzError if the environment has another time between actions."""
+        if config.control_interval != (own := self.interval):
+            one = config.control_interval
+            raise CzError(f"the policy's means are of {own:g} s between actions: policy_kwargs={{'interval': {one:g}}}")
+
+    def look(self, observation: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Map what the environment shows, shape (n, channels), to what the actor reads, and the next memory."""
+        means, memory = self.means(observation[:, self.added :], memory)
+        return torch.cat([observation, means], dim=1), memory
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[Any, Any]:
+        """Act as stable-baselines3's policies do on observations of a batch with ``critic_state``.
+
+        Of those of the environment as it is, shape (n, channels) or (channels,), it keeps the means in ``state``.
+        """
+        if observation.shape[-1] == self.width:
+            return super().predict(observation, state, episode_start, deterministic)
+        rows = torch.as_tensor(np.atleast_2d(observation))
+        memory = torch.zeros(len(rows), self.means.memory) if state is None else torch.as_tensor(state)
+        if episode_start is not None:
+            memory = torch.where(torch.as_tensor(np.atleast_1d(episode_start))[:, None] > 0, 0.0, memory)
+        seen, memory = self.look(rows, memory)
+        told = np.zeros((*observation.shape[:-1], self.width), np.float32)
+        told[..., : seen.shape[1]] = seen if observation.ndim > 1 else seen[0]
+        action, _ = super().predict(told, deterministic=deterministic)
+        return action, memory.numpy()
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        """Arguments with which :meth:`load` makes the policy again."""
+        return {**super()._get_constructor_parameters(), "interval": self.interval}
 
 
 class AsymmetricPolicy(Asymmetric, ActorCriticPolicy):
@@ -137,36 +191,46 @@ def _gains(channels: Sequence[Channel]) -> torch.Tensor:
 class StateEstimator(BaseFeaturesExtractor):
     """Features of an actor: what the sensors show now, and the unknown part of the state as estimated from the past.
 
-    The estimate is a network's, two layers of 128 units on the channels of "history". :class:`LearnState` fits it: the
-    reward does not change it.
+    The estimate is a network's, two layers of 128 units beside a linear map, on "history" and the means over hours.
+    :class:`LearnState` fits it: the reward does not change it.
     """
 
     gains: torch.Tensor
     state_gains: torch.Tensor
+    weights: torch.Tensor
 
     def __init__(self, space: Any) -> None:
         known = layout(space.shape[0])
         super().__init__(space, known.present + len(known.unknown))
-        self.layout, self.channels = known, len(known.history)
-        self.register_buffer("gains", _gains(known.history), persistent=False)
+        self.layout, self.channels = known, len(known.seen)
+        self.register_buffer("gains", _gains(known.seen), persistent=False)
         self.register_buffer("state_gains", _gains(known.state)[known.unknown], persistent=False)
-        self.estimate = nn.Sequential(*create_mlp(self.channels, len(known.unknown), [128, 128]))
+        weights = torch.tensor([HARDLY_TOLD.get(known.state[i].name, 1.0) for i in known.unknown])
+        self.register_buffer("weights", weights, persistent=False)
+        self.network = nn.Sequential(*create_mlp(self.channels, len(known.unknown), [128, 128]))
+        self.linear = nn.Linear(self.channels, len(known.unknown))
+
+    def estimate(self, seen: torch.Tensor) -> torch.Tensor:
+        """Map scaled channels to the unknown part of the state."""
+        estimate: torch.Tensor = self.network(seen) + self.linear(seen)
+        return estimate
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """Map observations (n, at least the channels of "history") to features (n, features)."""
+        """Map observations (n, at least the channels that the actor reads) to features (n, features)."""
         seen = observations[:, : self.channels] * self.gains
         with torch.no_grad():
             estimate = self.estimate(seen)
         return torch.cat([seen[:, : self.layout.present], estimate], dim=1)
 
     def loss(self, observations: torch.Tensor) -> torch.Tensor:
-        """Huber loss of the estimate; the true state follows the channels of "history"."""
+        """Weighted Huber loss of the estimate; the true state follows the channels that the actor reads."""
         seen, state = observations[:, : self.channels], observations[:, self.channels :]
-        return huber_loss(self.estimate(seen * self.gains), state[:, self.layout.unknown] * self.state_gains)
+        wanted = state[:, self.layout.unknown] * self.state_gains
+        return (self.weights * huber_loss(self.estimate(seen * self.gains), wanted, reduction="none")).mean()
 
 
 class StateFeatures(BaseFeaturesExtractor):
-    """Features of a critic: "history", the true state, and its products.
+    """Features of a critic: what the actor reads, the true state, and its products.
 
     With a linear plant and a quadratic cost the value is quadratic in the state.
     """
@@ -178,14 +242,14 @@ class StateFeatures(BaseFeaturesExtractor):
         self.width = len(known.state)
         super().__init__(space, space.shape[0] + self.width * (self.width + 1) // 2)
         self.layout = known
-        self.register_buffer("gains", _gains([*known.history, *known.state]), persistent=False)
+        self.register_buffer("gains", _gains([*known.seen, *known.state]), persistent=False)
 
     def state(self, observations: torch.Tensor) -> torch.Tensor:
         """Scale the true state and clip it to +-4, shape (n, channels of the state)."""
-        return (observations * self.gains)[:, len(self.layout.history) :].clamp(-4.0, 4.0)
+        return (observations * self.gains)[:, len(self.layout.seen) :].clamp(-4.0, 4.0)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """Map observations (n, channels of "history" and of the state) to features (n, features)."""
+        """Map observations (n, channels that the actor reads and of the state) to features (n, features)."""
         state = self.state(observations)
         half = 0.5 * state
         products = [half[:, i : i + 1] * state[:, i:] for i in range(self.width)]  # a fifth of the time of an index
@@ -204,9 +268,10 @@ class LearnState(BaseCallback):
 
     def _init_callback(self) -> None:
         policy: Any = require_type(Asymmetric, self.model.policy, "LearnState fits the estimate of such a policy alone")
+        policy.check_interval(self.training_env.get_attr("config", 0)[0])
         on_policy = isinstance(policy, AsymmetricPolicy)
         self.estimator: StateEstimator = policy.pi_features_extractor if on_policy else policy.actor.features_extractor
-        self.optimizer = torch.optim.Adam(self.estimator.estimate.parameters())
+        self.optimizer = torch.optim.Adam(self.estimator.parameters())
 
     def _on_step(self) -> bool:
         return True

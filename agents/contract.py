@@ -394,19 +394,25 @@ class OnnxPolicy:
         rows = np.atleast_2d(array)
         if self.residual:
             added, state = self.residual.read(rows, state, episode_start)
-            (wanted,) = self._run({"observation": np.concatenate([added, rows], axis=1)})
-            action, state = self.residual.act(wanted, state)
+            wanted, own = self._act(np.concatenate([added, rows], axis=1), state.network, episode_start)
+            action, state = self.residual.act(wanted, state._replace(network=own))
             return tag(action[0] if array.ndim == 1 else action, self.made_for), state
+        action, after = self._act(rows, state, episode_start)
+        if array.ndim == 1:
+            return action[0], after[0] if self.memory_length else after
+        return action, after
+
+    def _act(self, rows: Floats, state: Any, episode_start: Any) -> tuple[Floats, Any]:
+        """The network's output and its next memory."""
         if not self.memory_length:
-            (action,) = self._run({"observation": rows})
-            return (action[0] if array.ndim == 1 else action), state
+            return self._run({"observation": rows})[0], state
         before = np.zeros((len(rows), self.memory_length), np.float32)
         if state is not None:
             before += np.reshape(state, before.shape)
         if episode_start is not None:
             before[np.broadcast_to(np.asarray(episode_start, np.bool_), len(rows))] = 0.0
         action, after = self._run({"observation": rows, "state": before})
-        return (action[0], after[0]) if array.ndim == 1 else (action, after)
+        return action, after
 
     def _run(self, inputs: dict[str, Floats]) -> list[Floats]:
         try:

@@ -45,9 +45,10 @@ ALGORITHMS = {
 SAFE_WRAPPERS = (
     "Monitor", "TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics", "RecordVideo",
     "HumanRendering", "NormalizeReward", "TransformReward", "ClipReward", "VecMonitor", "VecNormalize", "VecCheckNan",
-    "VecVideoRecorder", "ActionRepeat",
+    "VecVideoRecorder", "ActionRepeat", "LongMemory",
 )  # fmt: skip
-"""Wrappers that leave observations and actions as they are, and VecNormalize, which the agent file contains."""
+"""Wrappers that leave observations and actions as they are, and VecNormalize and LongMemory, which the agent file
+contains."""
 
 
 def save_agent(
@@ -168,6 +169,8 @@ class DeterministicActor(nn.Module):
         """The LSTM of sb3-contrib's recurrent policies."""
         if isinstance(policy, RecurrentPolicy):
             self.memory = policy.initial_memory(1).shape[1]
+        elif isinstance(policy, Asymmetric):
+            self.memory = policy.means.memory
         elif self.lstm is not None:
             if self.lstm.num_layers > 1:
                 raise AgentFileError("a policy with more than one layer of LSTM cannot be written as an agent file")
@@ -188,7 +191,10 @@ class DeterministicActor(nn.Module):
         after: list[torch.Tensor] = []
         if isinstance(policy, RecurrentPolicy):
             action, *after = policy(x, *state)
-        elif isinstance(policy, ActorCriticPolicy):
+            return (action.clamp(-1.0, 1.0), *after)
+        if isinstance(policy, Asymmetric):
+            x, *after = policy.look(x, *state)
+        if isinstance(policy, ActorCriticPolicy):
             x = _features(policy.pi_features_extractor, x)
             if self.lstm is not None:
                 x, *after = lstm_step(x, state[0], self.lstm)
@@ -234,6 +240,8 @@ def to_agent(
     policy, env = algorithm.policy, algorithm.get_env()
     loop = None if env is None else unwrap_vec_wrapper(env, AddToController)
     residual: Residual | None = None if loop is None else loop.residual
+    if isinstance(policy, Asymmetric):
+        policy.check_interval(config)
     width = len(observations(config.process)[config.observation]) + (residual.width if residual else 0)
     content = to_onnx(policy, width, normalisation)
     contract = make_contract(

@@ -26,7 +26,7 @@ from cz_gym.env import CzVectorEnv
 from cz_gym.evaluation.metrics import Metrics, metrics
 from cz_gym.evaluation.protocol import TRAINING_SEEDS, VALIDATION_SEEDS, scenarios
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.sb3 import ActionRepeat, AddToController, CzVecEnv
+from cz_gym.sb3 import ActionRepeat, AddToController, CzVecEnv, LongMemory
 from cz_gym.support.errors import CzError, require_type
 
 from . import apg
@@ -195,6 +195,8 @@ class PPO(Reinforcement):
     name: str = "ppo"
     hidden: tuple[int, ...] = (32, 32)
     steps: int = 64_000_000
+    action: str = "rate"
+    """The heater's place on a puller whose meters err is kept by standing still; "smooth" must hold it by a reading."""
     num_envs: int = 2048
     """Many crystals at a time: what an action changes is small beside what the disturbances do."""
     action_repeat: int = 4
@@ -205,7 +207,7 @@ class PPO(Reinforcement):
     learning_rate: float = 1e-3
     gae_lambda: float = 0.9
     """Lower than stable-baselines3's 0.95: a critic that reads the true state is a good judge."""
-    log_std_init: float = -0.7
+    log_std_init: float = -1.2
     """Logarithm of the initial standard deviation of the actions."""
 
 
@@ -216,6 +218,7 @@ class PPOResidual(PPO):
     name: str = "pid-with-learning"
     steps: int = 24_000_000
     action: str = "direct"
+    log_std_init: float = -0.7
     controller: str = "pid-conventional"
     """Name of the controller, or FILE.py:NAME."""
     limits: tuple[float, float] = (0.1, 1.0)
@@ -230,7 +233,8 @@ class SAC(Reinforcement):
     name: str = "sac"
     hidden: tuple[int, ...] = (32, 32)
     critic_hidden: tuple[int, ...] = (128, 128)
-    steps: int = 20_000_000
+    steps: int = 12_000_000
+    action: str = "rate"
     num_envs: int = 512
     action_repeat: int = 4
     n_steps: int = 4
@@ -254,7 +258,8 @@ class SAC(Reinforcement):
         return self.action_repeat
 
 
-PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64))
+_smooth: dict[str, Any] = {"action": "smooth", "log_std_init": -0.7}
+PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64), **_smooth)
 """stable-baselines3's own PPO, told nothing: beside ``ppo`` it shows what the true state is worth in training."""
 RECIPES: dict[str, TrainingConfig] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG(), PPOResidual())}
 """Recipes by name: the choices of ``cz-gym train --algo``."""
@@ -264,7 +269,7 @@ _along: dict[str, Any] = {
     "scenario": "randomized=0.5,hard=0.5",
 }
 CRYSTAL_RECIPES: dict[str, TrainingConfig] = {
-    "ppo": PPO(name="ppo-along", **_along),
+    "ppo": PPO(name="ppo-along", **_smooth, **_along),
     "gradient": APG(name="gradient-along", units=64, steps=17_280_000, **_along),
 }
 """Recipes of CzCrystal-v0: one agent for crown, body and tail."""
@@ -299,6 +304,7 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base 
     settings = {name: getattr(recipe, name) for name in asdict(recipe) if name in known}
     if isinstance(recipe, Reinforcement):
         settings["learning_rate"] = partial(linear_schedule, recipe.learning_rate)
+        options |= {"interval": recipe.config.control_interval} if told else {}
         options["net_arch"] = {"pi": list(recipe.hidden), critics: list(recipe.critic_hidden)}
     if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer
         settings["learning_starts"] += done // recipe.action_repeat
@@ -319,6 +325,7 @@ def _environment(recipe: TrainingConfig, stagger: int, base: Base | None) -> Vec
     info: Any = "all" if recipe.told else "lean"
     batch = CzVectorEnv.from_config(recipe.config, recipe.num_envs, AutoresetMode.SAME_STEP, info=info)
     env: VecEnv = CzVecEnv(batch, stagger, critic_state=recipe.told)
+    env = LongMemory(env) if recipe.told else env
     if isinstance(recipe, PPOResidual):
         env = AddToController(env, Residual(require_type(Base, base, "it is added to"), *recipe.limits))
     return VecNormalize(ActionRepeat(env, recipe.action_repeat), norm_obs=False, gamma=recipe.gamma)

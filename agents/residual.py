@@ -51,6 +51,8 @@ class ResidualMemory(NamedTuple):
     """Last actions of the controller."""
     share: npt.NDArray[np.float32]
     """Shares of the limits that are in force [-]."""
+    network: Any = None
+    """The network's own memory, if it has one."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,8 @@ class Residual:
         share = np.zeros((len(history), 2), np.float32) if memory is None else memory.share
         share = share if begins is None else np.where(np.asarray(begins)[..., None], np.float32(0.0), share)
         asked = np.asarray(action)
-        return np.concatenate([asked, share], axis=1, dtype=np.float32), ResidualMemory(own, asked, share)
+        network = None if memory is None else memory.network
+        return np.concatenate([asked, share], axis=1, dtype=np.float32), ResidualMemory(own, asked, share, network)
 
     def act(self, wanted: Any, memory: ResidualMemory) -> tuple[npt.NDArray[Any], ResidualMemory]:
         """Actions of the environment, shape (n, 2), where the network wants these shares, and the memory."""

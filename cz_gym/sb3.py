@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -19,6 +20,7 @@ from cz_gym.crystal.process import ENVIRONMENTS
 from cz_gym.support.errors import CzError, require_type, unknown_name_message
 
 from .env import CzVectorEnv, EnvState
+from .process import Channel, Process
 from .spaces import observations
 
 
@@ -28,15 +30,16 @@ def make_vec_env(
 ) -> VecEnv:  # fmt: skip
     """Many environments for stable-baselines3; ``settings`` are the keywords of ``gym.make(env, ...)``.
 
-    ``stagger`` and ``critic_state`` are :class:`CzVecEnv`'s. With ``action_repeat`` above 1 each action is held for as
-    many steps while an agent learns, whose effect is then easier to see (:class:`ActionRepeat`); a trained agent acts
-    at every step.
+    ``stagger`` and ``critic_state`` are :class:`CzVecEnv`'s, the latter in a :class:`LongMemory`. With
+    ``action_repeat`` above 1 each action is held for as many steps while an agent learns, whose effect is then easier
+    to see (:class:`ActionRepeat`); a trained agent acts at every step.
     """
     if env not in ENVIRONMENTS:
         raise CzError(unknown_name_message("environment", env, ENVIRONMENTS))
     settings = {"process": ENVIRONMENTS[env]} | settings | ({"info": "all"} if critic_state else {})
     batch = CzVectorEnv(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
-    slots = CzVecEnv(batch, stagger, critic_state)
+    slots: VecEnv = CzVecEnv(batch, stagger, critic_state)
+    slots = LongMemory(slots) if critic_state else slots
     return slots if action_repeat == 1 else ActionRepeat(slots, action_repeat)
 
 
@@ -196,6 +199,117 @@ class Slot:
         if callable(value):
             raise AttributeError(f"a slot has no {name!r}; its methods are reset, get_state and set_state")
         return value[self._i] if name.startswith("np_random") else value
+
+
+LONG = (2400.0, 4800.0, 9600.0)
+"""Time constants of the means of a :class:`LongMemory` [s]; "history" ends at 20 minutes."""
+
+
+def long_channels(process: Process) -> tuple[Channel, ...]:
+    """The channels of :class:`LongMeans`: differences of neighbouring means, scaled as those of "history"."""
+    units = {each.name: each.unit for each in process.measured}
+    later = ("the value now", *(f"that over {time:g} s" for time in LONG))
+    return tuple(
+        Channel(units[name], scale, f"{name}: leaky mean over {time:g} s, minus {before}", f"{name}_mean_{time:g}s")
+        for time, before in zip(LONG, later, strict=False)
+        for name, scale in process.past
+    )
+
+
+class LongMeans(torch.nn.Module):
+    """Leaky means of the signals of "history" over hours, in matrix products, which agent files may hold.
+
+    A mean is the sum of readings, each weighed by its age, over the sum of the weights, so that it is right from the
+    first reading on. The memory has both sums, shape (n, ``memory``), zero where a crystal begins.
+    """
+
+    keep: torch.Tensor
+    pick: torch.Tensor
+    gain: torch.Tensor
+    one: torch.Tensor
+    sums: torch.Tensor
+    weights: torch.Tensor
+    differences: torch.Tensor
+
+    def __init__(self, process: Process, interval: float) -> None:
+        super().__init__()
+        history, past, n = observations(process)["history"], process.past, len(LONG)
+        signals, keep = len(past), np.exp(-interval / np.array(LONG))
+        names, rows = [each.name for each in history], np.eye(signals + 1)
+        pick = np.zeros((len(history), signals))
+        for column, each in enumerate(past):
+            place = names.index(each.name)
+            pick[place, column] = history[place].scale / each.scale
+        matrices = {
+            "keep": np.repeat(keep, signals + 1),
+            "pick": pick,
+            "gain": np.kron(1.0 - keep, rows[:signals]),
+            "one": np.kron(1.0 - keep, rows[signals]),
+            "sums": np.kron(np.eye(n), rows[:, :signals]),
+            "weights": np.kron(np.eye(n), np.outer(rows[signals], np.ones(signals))),
+            "differences": np.kron(np.eye(n + 1)[:, 1:] - np.eye(n + 1)[:, :-1], rows[:signals, :signals]),
+        }
+        for name, matrix in matrices.items():
+            self.register_buffer(name, torch.as_tensor(matrix, dtype=torch.float32), persistent=False)
+        self.memory = len(self.keep)
+        """Length of the memory."""
+
+    def forward(self, history: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Map "history", shape (n, channels), and the memory to :func:`long_channels` and the next memory."""
+        now = history @ self.pick
+        memory = memory * self.keep + now @ self.gain + self.one
+        means = (memory @ self.sums) / (memory @ self.weights)
+        return torch.cat([now, means], dim=1) @ self.differences, memory
+
+
+class LongMemory(VecEnvWrapper):
+    """Puts the channels of :class:`LongMeans` between those of "history" and the state of a ``critic_state`` batch.
+
+    For policies of :mod:`cz_gym.agents.asymmetric`, which keep the means themselves where they act alone.
+    """
+
+    def __init__(self, venv: VecEnv) -> None:
+        config = venv.get_attr("config", 0)[0]
+        self.channels = len(observations(config.process)["history"])
+        self.means = LongMeans(config.process, config.control_interval)
+        self.memory = torch.zeros(venv.num_envs, self.means.memory)
+        width: Any = np.array(venv.observation_space.shape) + len(long_channels(config.process))
+        super().__init__(venv, Box(-np.inf, np.inf, width, np.float32))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _remembering, (self.venv, self.memory)  # the wrapper's own state holds what does not pickle
+
+    def reset(self) -> Any:
+        """Reset every slot."""
+        return self._shown(self.venv.reset(), np.ones(self.num_envs, np.bool_))
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Hand the actions on."""
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> Any:
+        """Advance every slot."""
+        observation, reward, done, infos = self.venv.step_wait()
+        for i in np.flatnonzero(done).tolist():
+            last = infos[i]["terminal_observation"]
+            infos[i]["terminal_observation"] = self._with_means(last[None], self.memory[i : i + 1])[0][0]
+        return self._shown(observation, done), reward, done, infos
+
+    def _shown(self, observation: Any, begins: np.ndarray) -> np.ndarray:
+        self.memory[torch.from_numpy(begins)] = 0.0
+        shown, self.memory = self._with_means(observation, self.memory)
+        return shown
+
+    def _with_means(self, observation: np.ndarray, memory: torch.Tensor) -> tuple[np.ndarray, torch.Tensor]:
+        history, state = np.split(observation, [self.channels], axis=1)
+        features, memory = self.means(torch.from_numpy(history), memory)
+        return np.concatenate([history, features.numpy(), state], axis=1), memory
+
+
+def _remembering(venv: VecEnv, memory: torch.Tensor) -> LongMemory:
+    made = LongMemory(venv)
+    made.memory = memory.clone()
+    return made
 
 
 class ActionRepeat(VecEnvWrapper):

@@ -38,7 +38,7 @@ def test_an_agent_is_loaded_by_its_file():
 
 
 PPO = agents.load("ppo").settings
-OTHER = {"action": "rate", "control_interval": 2.0, "observation": "measured"}
+OTHER = {"action": "smooth", "control_interval": 2.0, "observation": "measured"}
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The adapter under stable-baselines3's wrappers, against a vector of scalar environments."""
 
 import copy
+import itertools
 import pickle
 
 import gymnasium as gym
@@ -16,7 +17,10 @@ from cz_gym import CzEnv, CzVectorEnv
 from cz_gym.agents import OnnxPolicy
 from cz_gym.agents.asymmetric import AsymmetricPolicy, AsymmetricSACPolicy, LearnState
 from cz_gym.agents.from_sb3 import save_agent
-from cz_gym.sb3 import environment_steps, make_vec_env
+from cz_gym.body.process import BODY
+from cz_gym.crystal.process import CRYSTAL
+from cz_gym.sb3 import LONG, LongMeans, environment_steps, long_channels, make_vec_env
+from cz_gym.spaces import observations
 from cz_gym.support.errors import CzError
 
 N = 3
@@ -165,37 +169,58 @@ def test_a_critic_may_read_the_true_state_that_no_actor_reads(tmp_path):
     """The state behind the observation is the one of ``observation="state"``, at the end of an episode too."""
     plain, told = adapter(), adapter(critic_state=True)
     states = CzVectorEnv(N, observation="state", autoreset_mode="SameStep", **SETTINGS)
+    means = LongMeans(BODY, 20.0)
+    seen_by_actor = plain.observation_space.shape[0] + len(long_channels(BODY))
     plain.seed(5)
     told.seed(5)
     channels = plain.observation_space.shape[0]
-    np.testing.assert_array_equal(told.reset(), np.hstack([plain.reset(), states.reset(seed=5)[0]]))
+    history, memory = plain.reset(), torch.zeros(N, means.memory)
+    over_hours, memory = means(torch.tensor(history), memory)
+    np.testing.assert_array_equal(told.reset(), np.hstack([history, over_hours, states.reset(seed=5)[0]]))
     actions = np.zeros((N, 2), np.float32)
     for _ in range(20):
         one, other = told.step(actions), plain.step(actions)
         state, *_, info = states.step(actions)
-        np.testing.assert_array_equal(one[0], np.hstack([other[0], state]))
+        ended = other[2][:, None]
+        last = np.stack([each.get("terminal_observation", other[0][i]) for i, each in enumerate(other[3])])
+        over_hours, memory = means(torch.tensor(last), memory)
+        if ended.all():
+            begun, _ = means(torch.tensor(other[0]), torch.zeros_like(memory))
+        shown = np.where(ended, begun, over_hours) if ended.any() else over_hours
+        np.testing.assert_array_equal(one[0], np.hstack([other[0], shown, state]))
     assert other[2].all()
     for i in range(N):
-        last = np.hstack([other[3][i]["terminal_observation"], info["final_obs"][i]])
-        np.testing.assert_array_equal(one[3][i]["terminal_observation"], last)
+        of_the_end = np.hstack([last[i], over_hours[i], info["final_obs"][i]])
+        np.testing.assert_allclose(one[3][i]["terminal_observation"], of_the_end, atol=1e-6)
     seen, other_state = one[0], one[0].copy()
-    other_state[:, channels:] = 7.0
-    ppo = PPO(AsymmetricPolicy, told, n_steps=8, batch_size=24, seed=0, device="cpu")
-    sac = SAC(AsymmetricSACPolicy, told, learning_starts=10, batch_size=24, seed=0, device="cpu")
+    other_state[:, seen_by_actor:] = 7.0
+    kept = {"policy_kwargs": {"interval": 20.0}, "batch_size": 24, "seed": 0, "device": "cpu"}
+    ppo, sac = (
+        PPO(AsymmetricPolicy, told, n_steps=8, **kept),
+        SAC(AsymmetricSACPolicy, told, learning_starts=10, **kept),
+    )
     for model in (ppo, sac):
         model.learn(24)
         action = model.predict(seen, deterministic=True)[0]
         np.testing.assert_array_equal(action, model.predict(other_state, deterministic=True)[0])
-        np.testing.assert_array_equal(action, model.predict(seen[:, :channels], deterministic=True)[0])
         with torch.no_grad():
             values = [judge(model, torch.tensor(each), torch.tensor(action)) for each in (seen, other_state)]
         assert (values[0] != values[1]).all()
         assert save_agent(tmp_path / "agent.onnx", model, "asymmetric").learned_from == "state"
-        agent = OnnxPolicy.load(tmp_path / "agent.onnx")
-        np.testing.assert_allclose(agent.predict(seen[:, :channels])[0], action, atol=1e-5)
+        agent, shown = OnnxPolicy.load(tmp_path / "agent.onnx"), told.reset()
+        state, memory, begins = None, None, np.ones(N, bool)
+        for _ in range(30):  # the policy and the file keep the means that the batch shows
+            action, _ = model.predict(shown, deterministic=True)
+            own, state = model.predict(shown[:, :channels], state, begins, deterministic=True)
+            filed, memory = agent.predict(shown[:, :channels], memory, begins)
+            np.testing.assert_allclose(own, action, atol=1e-5)
+            np.testing.assert_allclose(filed, action, atol=1e-5)
+            shown, _, begins, _ = told.step(action)
     with pytest.raises(ValueError, match="needs observation='history'"):
         adapter(observation="measured", critic_state=True)
     sac.learn(24, LearnState())
+    with pytest.raises(CzError, match=r"5 s between actions: policy_kwargs=\{'interval': 20\}"):
+        PPO(AsymmetricPolicy, told, n_steps=8, batch_size=24, device="cpu").learn(24, LearnState())
     with pytest.raises(ValueError, match=r"^this needs an Asymmetric, not .*alone$"):
         PPO("MlpPolicy", plain, n_steps=8, batch_size=24, device="cpu").learn(24, LearnState())
     for algorithm, policy in ((PPO, AsymmetricPolicy), (SAC, AsymmetricSACPolicy)):
@@ -203,9 +228,30 @@ def test_a_critic_may_read_the_true_state_that_no_actor_reads(tmp_path):
             algorithm(policy, plain)
 
 
+@pytest.mark.parametrize("process", [BODY, CRYSTAL])
+def test_means_over_hours_are_sums_weighted_by_age(process):
+    rng, past, interval = np.random.default_rng(0), process.past, 20.0
+    history = observations(process)["history"]
+    places = [[each.name for each in history].index(signal.name) for signal in past]
+    scale = [history[place].scale / signal.scale for place, signal in zip(places, past, strict=True)]
+    seen = rng.normal(size=(400, 2, len(history))).astype(np.float32)
+    means = LongMeans(process, interval)
+    memory = torch.zeros(2, means.memory)
+    for row in seen:
+        shown, memory = means(torch.tensor(row), memory)
+    chain = [seen[-1][:, places]]
+    for time in LONG:
+        weights = np.exp(-interval / time * np.arange(len(seen))[::-1])
+        chain.append(np.einsum("t,tnc->nc", weights, seen[:, :, places].astype(float)) / weights.sum())
+    expected = np.hstack([(later - earlier) * scale for earlier, later in itertools.pairwise(chain)])
+    np.testing.assert_allclose(shown, expected, atol=1e-4)
+    assert len({each.name for each in long_channels(process)}) == shown.shape[1]
+
+
 def test_an_estimate_is_fitted_to_the_state_and_not_to_the_reward():
     told = adapter(critic_state=True)
-    model = PPO(AsymmetricPolicy, told, 3e-3, n_steps=8, batch_size=24, seed=0, device="cpu")
+    kept = {"interval": 20.0}
+    model = PPO(AsymmetricPolicy, told, 3e-3, n_steps=8, batch_size=24, seed=0, device="cpu", policy_kwargs=kept)
     estimator = model.policy.pi_features_extractor
     before = [each.detach().clone() for each in estimator.parameters()]
     model.learn(48)
@@ -216,14 +262,14 @@ def test_an_estimate_is_fitted_to_the_state_and_not_to_the_reward():
     assert estimator.loss(seen).item() < 0.75 * start
     with torch.no_grad():  # an estimator that is right, in the units of its features
         state = seen[:, estimator.gains.numel() :][:, [0, 1, 2, 3, 4, 14, 15, 16, 17]] * estimator.state_gains
-        estimator.estimate.forward = lambda _: state
+        estimator.estimate = lambda _: state
         assert estimator.loss(seen).item() == 0.0
         torch.testing.assert_close(estimator(seen)[:, 13:], state)
 
 
 def test_the_environment_is_named():
     env = make_vec_env(2, env="CzCrystal-v0", stage="tail", critic_state=True)
-    assert env.reset().shape == (2, 95 + 21)
+    assert env.reset().shape == (2, 95 + 15 + 21)
     assert env.get_attr("config")[0].process.name == "CzCrystal-v0"
     env.close()
     with pytest.raises(CzError, match="unknown environment 'CzCrystal': did you mean 'CzCrystal-v0'"):
