@@ -91,7 +91,14 @@ class Asymmetric(BasePolicy):
         """Number of channels that the environment shows."""
         self.interval = interval
         super().__init__(observation_space, *others, **named)
-        self.means, self.added = LongMeans(known.process, interval), len(known.added)
+        self.added = len(known.added)
+        for name, matrix in LongMeans.over_hours(known.process, interval)._asdict().items():
+            self.register_buffer(f"means_{name}", torch.from_numpy(matrix), persistent=False)
+
+    @property
+    def means(self) -> LongMeans:
+        """The means over hours that the policy keeps."""
+        return LongMeans(*(getattr(self, f"means_{name}") for name in LongMeans._fields))
 
     def check_interval(self, config: Config) -> None:
         """CzError if the environment has another time between actions."""
@@ -101,7 +108,7 @@ class Asymmetric(BasePolicy):
 
     def look(self, observation: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Map what the environment shows, shape (n, channels), to what the actor reads, and the next memory."""
-        means, memory = self.means(observation[:, self.added :], memory)
+        means, memory = self.means.after(observation[:, self.added :], memory)
         return torch.cat([observation, means], dim=1), memory
 
     def predict(
@@ -114,7 +121,7 @@ class Asymmetric(BasePolicy):
         if observation.shape[-1] == self.width:
             return super().predict(observation, state, episode_start, deterministic)
         rows = torch.as_tensor(np.atleast_2d(observation))
-        memory = torch.zeros(len(rows), self.means.memory) if state is None else torch.as_tensor(state)
+        memory = torch.zeros(len(rows), len(self.means.keep)) if state is None else torch.as_tensor(state)
         if episode_start is not None:
             memory = torch.where(torch.as_tensor(np.atleast_1d(episode_start))[:, None] > 0, 0.0, memory)
         seen, memory = self.look(rows, memory)

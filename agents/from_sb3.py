@@ -170,7 +170,7 @@ class DeterministicActor(nn.Module):
         if isinstance(policy, RecurrentPolicy):
             self.memory = policy.initial_memory(1).shape[1]
         elif isinstance(policy, Asymmetric):
-            self.memory = policy.means.memory
+            self.memory = len(policy.means.keep)
         elif self.lstm is not None:
             if self.lstm.num_layers > 1:
                 raise AgentFileError("a policy with more than one layer of LSTM cannot be written as an agent file")

@@ -6,10 +6,9 @@ the package imports it.
 
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
-import torch
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -216,23 +215,33 @@ def long_channels(process: Process) -> tuple[Channel, ...]:
     )
 
 
-class LongMeans(torch.nn.Module):
-    """Leaky means of the signals of "history" over hours, in matrix products, which agent files may hold.
+class LongMeans(NamedTuple):
+    """Leaky means of the signals of "history" over hours, in matrix products of NumPy's or torch's arrays.
 
     A mean is the sum of readings, each weighed by its age, over the sum of the weights, so that it is right from the
-    first reading on. The memory has both sums, shape (n, ``memory``), zero where a crystal begins.
+    first reading on. The memory has both sums, shape (n, ``len(keep)``), zero where a crystal begins.
     """
 
-    keep: torch.Tensor
-    pick: torch.Tensor
-    gain: torch.Tensor
-    one: torch.Tensor
-    sums: torch.Tensor
-    weights: torch.Tensor
-    differences: torch.Tensor
+    keep: Any
+    """Share of the sums that is left after a step, shape (memory,)."""
+    pick: Any
+    """Takes the signals from "history", shape (channels, signals)."""
+    gain: Any
+    """What a signal adds to the sums, shape (signals, memory)."""
+    one: Any
+    """What a step adds to the sums of the weights, shape (memory,)."""
+    sums: Any
+    """Takes the sums of readings from the memory, shape (memory, means)."""
+    weights: Any
+    """Takes the sums of the weights, shape (memory, means)."""
+    less: Any
+    """The value now, which the first means are shown relative to, shape (signals, means)."""
+    differences: Any
+    """Each mean less the one before, shape (means, means)."""
 
-    def __init__(self, process: Process, interval: float) -> None:
-        super().__init__()
+    @classmethod
+    def over_hours(cls, process: Process, interval: float) -> Self:
+        """The means over :data:`LONG` of the signals of a process, for an interval between readings [s]."""
         history, past, n = observations(process)["history"], process.past, len(LONG)
         signals, keep = len(past), np.exp(-interval / np.array(LONG))
         names, rows = [each.name for each in history], np.eye(signals + 1)
@@ -240,26 +249,25 @@ class LongMeans(torch.nn.Module):
         for column, each in enumerate(past):
             place = names.index(each.name)
             pick[place, column] = history[place].scale / each.scale
-        matrices = {
-            "keep": np.repeat(keep, signals + 1),
-            "pick": pick,
-            "gain": np.kron(1.0 - keep, rows[:signals]),
-            "one": np.kron(1.0 - keep, rows[signals]),
-            "sums": np.kron(np.eye(n), rows[:, :signals]),
-            "weights": np.kron(np.eye(n), np.outer(rows[signals], np.ones(signals))),
-            "differences": np.kron(np.eye(n + 1)[:, 1:] - np.eye(n + 1)[:, :-1], rows[:signals, :signals]),
-        }
-        for name, matrix in matrices.items():
-            self.register_buffer(name, torch.as_tensor(matrix, dtype=torch.float32), persistent=False)
-        self.memory = len(self.keep)
-        """Length of the memory."""
+        each_signal = rows[:signals, :signals]
+        matrices = (
+            np.repeat(keep, signals + 1),
+            pick,
+            np.kron(1.0 - keep, rows[:signals]),
+            np.kron(1.0 - keep, rows[signals]),
+            np.kron(np.eye(n), rows[:, :signals]),
+            np.kron(np.eye(n), np.outer(rows[signals], np.ones(signals))),
+            np.kron(-np.eye(n)[0], each_signal),
+            np.kron(np.eye(n) - np.eye(n, k=1), each_signal),
+        )
+        return cls(*(matrix.astype(np.float32) for matrix in matrices))
 
-    def forward(self, history: torch.Tensor, memory: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def after(self, history: Any, memory: Any) -> tuple[Any, Any]:
         """Map "history", shape (n, channels), and the memory to :func:`long_channels` and the next memory."""
         now = history @ self.pick
         memory = memory * self.keep + now @ self.gain + self.one
         means = (memory @ self.sums) / (memory @ self.weights)
-        return torch.cat([now, means], dim=1) @ self.differences, memory
+        return means @ self.differences + now @ self.less, memory
 
 
 class LongMemory(VecEnvWrapper):
@@ -271,8 +279,8 @@ class LongMemory(VecEnvWrapper):
     def __init__(self, venv: VecEnv) -> None:
         config = venv.get_attr("config", 0)[0]
         self.channels = len(observations(config.process)["history"])
-        self.means = LongMeans(config.process, config.control_interval)
-        self.memory = torch.zeros(venv.num_envs, self.means.memory)
+        self.means = LongMeans.over_hours(config.process, config.control_interval)
+        self.memory = np.zeros((venv.num_envs, len(self.means.keep)), np.float32)
         width: Any = np.array(venv.observation_space.shape) + len(long_channels(config.process))
         super().__init__(venv, Box(-np.inf, np.inf, width, np.float32))
 
@@ -296,19 +304,19 @@ class LongMemory(VecEnvWrapper):
         return self._shown(observation, done), reward, done, infos
 
     def _shown(self, observation: Any, begins: np.ndarray) -> np.ndarray:
-        self.memory[torch.from_numpy(begins)] = 0.0
+        self.memory[begins] = 0.0
         shown, self.memory = self._with_means(observation, self.memory)
         return shown
 
-    def _with_means(self, observation: np.ndarray, memory: torch.Tensor) -> tuple[np.ndarray, torch.Tensor]:
+    def _with_means(self, observation: np.ndarray, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         history, state = np.split(observation, [self.channels], axis=1)
-        features, memory = self.means(torch.from_numpy(history), memory)
-        return np.concatenate([history, features.numpy(), state], axis=1), memory
+        features, memory = self.means.after(history, memory)
+        return np.concatenate([history, features, state], axis=1), memory
 
 
-def _remembering(venv: VecEnv, memory: torch.Tensor) -> LongMemory:
+def _remembering(venv: VecEnv, memory: np.ndarray) -> LongMemory:
     made = LongMemory(venv)
-    made.memory = memory.clone()
+    made.memory = memory.copy()
     return made
 
 

@@ -169,13 +169,13 @@ def test_a_critic_may_read_the_true_state_that_no_actor_reads(tmp_path):
     """The state behind the observation is the one of ``observation="state"``, at the end of an episode too."""
     plain, told = adapter(), adapter(critic_state=True)
     states = CzVectorEnv(N, observation="state", autoreset_mode="SameStep", **SETTINGS)
-    means = LongMeans(BODY, 20.0)
+    means = LongMeans.over_hours(BODY, 20.0)
     seen_by_actor = plain.observation_space.shape[0] + len(long_channels(BODY))
     plain.seed(5)
     told.seed(5)
     channels = plain.observation_space.shape[0]
-    history, memory = plain.reset(), torch.zeros(N, means.memory)
-    over_hours, memory = means(torch.tensor(history), memory)
+    history, memory = plain.reset(), np.zeros((N, len(means.keep)), np.float32)
+    over_hours, memory = means.after(history, memory)
     np.testing.assert_array_equal(told.reset(), np.hstack([history, over_hours, states.reset(seed=5)[0]]))
     actions = np.zeros((N, 2), np.float32)
     for _ in range(20):
@@ -183,9 +183,9 @@ def test_a_critic_may_read_the_true_state_that_no_actor_reads(tmp_path):
         state, *_, info = states.step(actions)
         ended = other[2][:, None]
         last = np.stack([each.get("terminal_observation", other[0][i]) for i, each in enumerate(other[3])])
-        over_hours, memory = means(torch.tensor(last), memory)
+        over_hours, memory = means.after(last, memory)
         if ended.all():
-            begun, _ = means(torch.tensor(other[0]), torch.zeros_like(memory))
+            begun, _ = means.after(other[0], np.zeros_like(memory))
         shown = np.where(ended, begun, over_hours) if ended.any() else over_hours
         np.testing.assert_array_equal(one[0], np.hstack([other[0], shown, state]))
     assert other[2].all()
@@ -235,10 +235,10 @@ def test_means_over_hours_are_sums_weighted_by_age(process):
     places = [[each.name for each in history].index(signal.name) for signal in past]
     scale = [history[place].scale / signal.scale for place, signal in zip(places, past, strict=True)]
     seen = rng.normal(size=(400, 2, len(history))).astype(np.float32)
-    means = LongMeans(process, interval)
-    memory = torch.zeros(2, means.memory)
+    means = LongMeans.over_hours(process, interval)
+    memory = np.zeros((2, len(means.keep)), np.float32)
     for row in seen:
-        shown, memory = means(torch.tensor(row), memory)
+        shown, memory = means.after(row, memory)
     chain = [seen[-1][:, places]]
     for time in LONG:
         weights = np.exp(-interval / time * np.arange(len(seen))[::-1])
