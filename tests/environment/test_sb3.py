@@ -181,12 +181,10 @@ def test_a_critic_may_read_the_true_state_that_no_actor_reads(tmp_path):
     for _ in range(20):
         one, other = told.step(actions), plain.step(actions)
         state, *_, info = states.step(actions)
-        ended = other[2][:, None]
         last = np.stack([each.get("terminal_observation", other[0][i]) for i, each in enumerate(other[3])])
         over_hours, memory = means.after(last, memory)
-        if ended.all():
-            begun, _ = means.after(other[0], np.zeros_like(memory))
-        shown = np.where(ended, begun, over_hours) if ended.any() else over_hours
+        begun, _ = means.after(other[0], np.zeros_like(memory))
+        shown = np.where(other[2][:, None], begun, over_hours)
         np.testing.assert_array_equal(one[0], np.hstack([other[0], shown, state]))
     assert other[2].all()
     for i in range(N):
