@@ -408,6 +408,8 @@ class OnnxPolicy:
             return self._run({"observation": rows})[0], state
         before = np.zeros((len(rows), self.memory_length), np.float32)
         if state is not None:
+            if np.size(state) != before.size:
+                raise CzError(f"expected the state that predict returned, shape {before.shape}, not {np.shape(state)}")
             before += np.reshape(state, before.shape)
         if episode_start is not None:
             before[np.broadcast_to(np.asarray(episode_start, np.bool_), len(rows))] = 0.0

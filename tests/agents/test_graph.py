@@ -13,6 +13,7 @@ from cz_gym.agents.contract import make_contract, read_agent
 from cz_gym.agents.graph import MAX_ACTIVATIONS, MAX_NODES, OPERATORS, check_graph
 from cz_gym.config import make_config
 from cz_gym.spaces import MEASURED
+from cz_gym.support.errors import CzError
 from tests import contracts
 from tests.conftest import python
 from tests.contracts import LINEAR, facts, graph_of, value
@@ -71,6 +72,8 @@ def test_an_agent_with_a_memory_begins_each_episode_at_zero():
     one, state = policy.predict(seen[0])
     assert (one.shape, state.shape) == ((2,), (2,))
     assert policy.predict(seen[0], state)[0][0] == 0.5
+    with pytest.raises(CzError, match=r"the state that predict returned, shape \(1, 2\), not \(3,\)"):
+        policy.predict(seen[0], np.zeros(3))
 
 
 LOOP = """

@@ -20,13 +20,14 @@ from tqdm import tqdm
 from cz_gym import CzEnv
 from cz_gym.agents import AgentFileError, OnnxPolicy, load, recipes
 from cz_gym.agents import train as training
+from cz_gym.agents.asymmetric import LearnState
 from cz_gym.agents.recipes import CRYSTAL_RECIPES, PPO, RECIPES, PPOResidual, make_algorithm
 from cz_gym.agents.train import CHECKPOINT, TrainingRun, load_checkpoint, restore, to_bytes
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
 from cz_gym.evaluation.protocol import TEST_SEEDS, VALIDATION_SEEDS
 from cz_gym.evaluation.rollout import rollout
-from cz_gym.sb3 import CzVecEnv
+from cz_gym.sb3 import LONG, CzVecEnv
 from cz_gym.support.command_line import interpreter
 from cz_gym.tools import train
 from cz_gym.tools.registry import make_base, make_controller
@@ -398,6 +399,14 @@ def test_no_two_training_seeds_meet_the_same_crystals(name):
         env.close()
     assert [len(each) for each in met] == [8] * 4
     assert len(set.union(*met)) == 4 * 8
+
+
+def test_means_over_hours_are_of_the_puller_s_interval():
+    recipe = replace(SMALL_PPO, puller="germanium")
+    algorithm = make_algorithm(recipe, 0)
+    algorithm.learn(recipe.n_steps, LearnState())
+    assert algorithm.policy.interval == recipe.config.control_interval == 1.0
+    assert algorithm.policy.means.keep[0].item() == pytest.approx(np.exp(-1.0 / LONG[0]))
 
 
 @pytest.mark.parametrize("name", RECIPES)
