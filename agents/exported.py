@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .graph import INPUTS, OUTPUTS, GraphError, check_graph
+from .graph import DOMAINS, INPUTS, OUTPUTS, GraphError, check_graph
 
 OPSET, IR_VERSION = 17, 9
 """Versions of the graphs that are written."""
@@ -43,6 +43,8 @@ def to_plain(source: bytes | Path, channels: int) -> bytes:
             raise GraphError("keeps weights in another file: give the path of the ONNX file, beside which it lies")
         if len(model.functions):
             model = inliner.inline_local_functions(model)
+        if others := [f"{node.domain}.{node.op_type}" for node in model.graph.node if node.domain not in DOMAINS]:
+            raise GraphError(f"uses operators beyond the standard ONNX ones, {others[0]}")
         if (
             any(node.op_type == "BatchNormalization" for node in model.graph.node)
             and model.opset_import[0].version < 14
@@ -66,7 +68,7 @@ class _Rebuilt:
     def __init__(self, model: Any, channels: int) -> None:
         from onnx import helper, numpy_helper
 
-        self.opset = next((each.version for each in model.opset_import if each.domain in ("", "ai.onnx")), OPSET)
+        self.opset = next((each.version for each in model.opset_import if each.domain in DOMAINS), OPSET)
         self.constants: dict[str, Any] = {each.name: numpy_helper.to_array(each) for each in model.graph.initializer}
         self.inputs = [each for each in model.graph.input if each.name not in self.constants]
         for value in self.inputs:

@@ -17,6 +17,8 @@ OPERATORS = (
     "Softplus", "Split", "Sqrt", "Sub", "Tanh",
 )  # fmt: skip
 """Operators an agent may use, of the standard ONNX domain."""
+DOMAINS = "", "ai.onnx"
+"""Names of the standard operators' domain."""
 OPSETS = range(13, 22)
 """Versions of the standard operators that an agent may use."""
 INPUTS, OUTPUTS = ("observation", "state"), ("action", "next_state")
@@ -64,7 +66,7 @@ def _check_model(model: Any) -> None:
     graph = model.graph
     if not len(model.opset_import):
         raise GraphError("not a sound ONNX model")
-    if len(model.opset_import) != 1 or model.opset_import[0].domain not in ("", "ai.onnx"):
+    if len(model.opset_import) != 1 or model.opset_import[0].domain not in DOMAINS:
         raise GraphError("uses operators beyond the standard ONNX ones")
     if model.opset_import[0].version not in OPSETS:
         version = model.opset_import[0].version
@@ -126,7 +128,7 @@ def _node(node: Any) -> Any:
     """A node rebuilt from its operator, names and numbers; GraphError for one that no agent may have."""
     from onnx import helper
 
-    if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
+    if node.domain not in DOMAINS or node.op_type not in OPERATORS:
         name = f"{node.domain}:{node.op_type}" if node.domain else node.op_type
         raise GraphError(f"uses the operator {name!r:.60}; allowed: {', '.join(OPERATORS)}")
     if len(node.input) > MAX_NODES or len(node.output) > MAX_NODES:

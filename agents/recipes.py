@@ -197,18 +197,21 @@ class PPO(Reinforcement):
     steps: int = 64_000_000
     action: str = "rate"
     """The heater's place on a puller whose meters err is kept by standing still; "smooth" must hold it by a reading."""
-    num_envs: int = 2048
+    num_envs: int = 1024
     """Many crystals at a time: what an action changes is small beside what the disturbances do."""
     action_repeat: int = 4
     n_steps: int = 32
     fewest_updates: int = 90
-    batch_size: int = 2048
+    batch_size: int = 1024
     n_epochs: int = 5
     learning_rate: float = 1e-3
     gae_lambda: float = 0.9
     """Lower than stable-baselines3's 0.95: a critic that reads the true state is a good judge."""
     log_std_init: float = -1.2
-    """Logarithm of the initial standard deviation of the actions."""
+    """Logarithm of the standard deviation of the actions in training, at its begin."""
+    learn_std: bool = False
+    """Whether it is learned. It then shrinks to a third, as small actions cost less, and what an action does is harder
+    to see: the same steps taught less."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,7 +221,10 @@ class PPOResidual(PPO):
     name: str = "pid-with-learning"
     steps: int = 24_000_000
     action: str = "direct"
+    num_envs: int = 2048
+    batch_size: int = 2048
     log_std_init: float = -0.7
+    learn_std: bool = True
     controller: str = "pid-conventional"
     """Name of the controller, or FILE.py:NAME."""
     limits: tuple[float, float] = (0.1, 1.0)
@@ -258,7 +264,13 @@ class SAC(Reinforcement):
         return self.action_repeat
 
 
-_smooth: dict[str, Any] = {"action": "smooth", "log_std_init": -0.7}
+_smooth: dict[str, Any] = {
+    "action": "smooth",
+    "num_envs": 2048,
+    "batch_size": 2048,
+    "log_std_init": -0.7,
+    "learn_std": True,
+}
 PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64), **_smooth)
 """stable-baselines3's own PPO, told nothing: beside ``ppo`` it shows what the true state is worth in training."""
 RECIPES: dict[str, TrainingConfig] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG(), PPOResidual())}
@@ -309,6 +321,8 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base 
     if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer
         settings["learning_starts"] += done // recipe.action_repeat
     made: BaseAlgorithm = kind(policy, env, policy_kwargs=options, seed=seed, device="cpu", **settings)
+    if isinstance(recipe, PPO):
+        made.policy.log_std.requires_grad_(recipe.learn_std)
     if isinstance(recipe, APG):
         recipe.begin(made)
     # The algorithm's constructor has set the slots' seeds to ``seed`` and those after it: neighbouring training seeds

@@ -432,6 +432,13 @@ def test_a_small_budget_has_fewer_crystals_and_smaller_batches(name, batch):
     assert recipe.with_steps(recipe.steps) == recipe
 
 
+@pytest.mark.parametrize("learns", [False, True])
+def test_exploration_shrinks_only_where_a_recipe_says_so(learns):
+    recipe = replace(SMALL, learn_std=learns)
+    log_std = trained(recipe).policy.log_std.tolist()
+    assert (log_std == pytest.approx([recipe.log_std_init] * 2, abs=1e-7)) != learns
+
+
 SEEDS = range(1_000_000, 1_000_006)
 
 
