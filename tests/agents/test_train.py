@@ -198,7 +198,8 @@ def test_ctrl_c_in_the_middle_of_an_update_saves_after_it(tmp_path, monkeypatch,
     assert f"{interpreter()} -m cz_gym train --steps 12000 --out {folder} --resume continues" in capsys.readouterr().err
     checkpoint = load_checkpoint(folder / CHECKPOINT)
     assert 2 * 4096 < checkpoint.steps < 3 * 4096
-    assert float(checkpoint.parameters["policy.optimizer"]["state"][0]["step"]) == 8.0
+    moments = checkpoint.parameters["policy.optimizer"]["state"]
+    assert {float(each["step"]) for each in moments.values()} == {8.0}
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
@@ -216,7 +217,7 @@ def test_ctrl_c_in_the_middle_of_an_update_saves_after_it(tmp_path, monkeypatch,
         (["--resume"], "nothing to resume"),
         (["--set", "learning_rat=1"], "unknown field 'learning_rat': did you mean 'learning_rate'?"),
         (["--set", "n_epochs=few"], "--set n_epochs=few: n_epochs must be a whole number from 1 on, as 5"),
-        (["--set", "num_envs=0"], "num_envs must be a whole number from 1 on, as 2048"),
+        (["--set", "num_envs=0"], "num_envs must be a whole number from 1 on, as 1024"),
         (["--set", "learning_rate=-1"], "learning_rate must be float, as 0.001"),
         (["--set", "hidden=a,b"], "hidden must be numbers with commas between, as (32, 32)"),
         (["--set", "steps=7"], "unknown field 'steps'"),
