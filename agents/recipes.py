@@ -210,8 +210,8 @@ class PPO(Reinforcement):
     log_std_init: float = -1.2
     """Logarithm of the standard deviation of the actions in training, at its begin."""
     learn_std: bool = False
-    """Whether it is learned. It then shrinks to a third, as small actions cost less, and what an action does is harder
-    to see: the same steps taught less."""
+    """Learn the standard deviation, which then shrinks, as small actions cost less, and hides what an action does; else
+    keep it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,10 +221,6 @@ class PPOResidual(PPO):
     name: str = "pid-with-learning"
     steps: int = 24_000_000
     action: str = "direct"
-    num_envs: int = 2048
-    batch_size: int = 2048
-    log_std_init: float = -0.7
-    learn_std: bool = True
     controller: str = "pid-conventional"
     """Name of the controller, or FILE.py:NAME."""
     limits: tuple[float, float] = (0.1, 1.0)
@@ -264,16 +260,12 @@ class SAC(Reinforcement):
         return self.action_repeat
 
 
-_smooth: dict[str, Any] = {
-    "action": "smooth",
-    "num_envs": 2048,
-    "batch_size": 2048,
-    "log_std_init": -0.7,
-    "learn_std": True,
-}
-PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64), **_smooth)
+_learned_std: dict[str, Any] = {"num_envs": 2048, "batch_size": 2048, "log_std_init": -0.7, "learn_std": True}
+PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64), action="smooth", **_learned_std)
 """stable-baselines3's own PPO, told nothing: beside ``ppo`` it shows what the true state is worth in training."""
-RECIPES: dict[str, TrainingConfig] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG(), PPOResidual())}
+RECIPES: dict[str, TrainingConfig] = {
+    recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG(), PPOResidual(**_learned_std))
+}
 """Recipes by name: the choices of ``cz-gym train --algo``."""
 _along: dict[str, Any] = {
     "environment": CRYSTAL_ENV,
@@ -281,7 +273,7 @@ _along: dict[str, Any] = {
     "scenario": "randomized=0.5,hard=0.5",
 }
 CRYSTAL_RECIPES: dict[str, TrainingConfig] = {
-    "ppo": PPO(name="ppo-along", **_smooth, **_along),
+    "ppo": PPO(name="ppo-along", action="smooth", **_learned_std, **_along),
     "gradient": APG(name="gradient-along", units=64, steps=17_280_000, **_along),
 }
 """Recipes of CzCrystal-v0: one agent for crown, body and tail."""

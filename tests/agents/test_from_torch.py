@@ -225,7 +225,7 @@ OF_BOTH_ROWS = (
     helper.make_node("Reshape", ["t", "shape"], ["y"]),
 )
 
-OF_TREES = helper.make_node("Scaler", ["x"], ["y"], domain="ai.onnx.ml", offset=[0.0], scale=[1.0])
+OF_ANOTHER_DOMAIN = helper.make_node("Scaler", ["x"], ["y"], domain="ai.onnx.ml", offset=[0.0], scale=[1.0])
 """As scikit-learn's models are exported."""
 
 
@@ -258,7 +258,7 @@ def test_shape_arithmetic_halves_and_double_precision_are_computed(tmp_path):
     [
         (lambda: graph(*OF_OTHER_ROWS, weights=[PICK]), "uses the operator 'Softmax'"),
         (lambda: graph(*OF_BOTH_ROWS), r"changes the order of numbers, from \[2, 'n'\] to \['n', 2\]"),
-        (lambda: graph(OF_TREES), r"beyond the standard ONNX ones, ai\.onnx\.ml\.Scaler"),
+        (lambda: graph(OF_ANOTHER_DOMAIN), r"beyond the standard ONNX ones, ai\.onnx\.ml\.Scaler"),
         (lambda: exported(MLP(nn.Tanh()), []).replace(b"batch", b"batcj") + b"\0", "not a sound ONNX model"),
     ],
 )

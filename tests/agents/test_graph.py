@@ -214,7 +214,7 @@ HOSTILE = {
     "nothing": (lambda: b"", "not a sound"),
     "pickle": (lambda: b"\x80\x04c__builtin__\nexec\n.", "not a sound"),
     "many empty nodes": (lambda: OPSET + field(b"\x3a", b"\x0a\x00" * 1_900_000), "1900000 nodes"),
-    "many empty weights": (lambda: OPSET + field(b"\x3a", b"\x0a\x00" + b"\x2a\x00" * 1_000_000), "1 nodes"),
+    "many empty weights": (lambda: OPSET + field(b"\x3a", b"\x0a\x00" + b"\x2a\x00" * 1_900_000), "1 nodes"),
     "nested messages": (lambda: nested(), "not a sound"),
 }  # fmt: skip
 
