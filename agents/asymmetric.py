@@ -10,7 +10,7 @@ stable-baselines3.
 from collections.abc import Sequence
 from functools import cache
 from itertools import pairwise, product
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -68,25 +68,31 @@ class Layout(NamedTuple):
 
 
 @cache
-def layout(width: int) -> Layout:
-    """Find the environment whose "history" and true state have that many channels; CzError if none has."""
+def layout(width: int, told: bool = True) -> Layout:
+    """Find the environment whose "history", means over hours and, if ``told``, true state have that many channels;
+    CzError if none has."""
     for process, added in product(ENVIRONMENTS.values(), ((), ADDED)):
         unknown = [i for i, each in enumerate(process.state) if each not in process.measured]
         known = Layout(process, added, len(added) + len(process.measured) + 1, unknown)
-        if width == len(known.seen) + len(known.state):
+        if width == len(known.seen) + told * len(known.state):
             return known
-    raise CzError("this policy is told the true state: make_vec_env(..., critic_state=True)")
+    if told:
+        raise CzError("this policy is told the true state: make_vec_env(..., critic_state=True)")
+    raise CzError("this policy reads means over hours: cz_gym.sb3.LongMemory(make_vec_env(...))")
 
 
-class Asymmetric(BasePolicy):
-    """A policy whose critic reads the plant's true state behind what its actor sees.
+class Remembering(BasePolicy):
+    """A policy whose actor reads "history" and :class:`cz_gym.sb3.LongMeans`, which it keeps where it acts alone.
 
     ``interval`` is the time between actions [s] of the environments that it acts in.
     """
 
+    told: ClassVar[bool] = False
+    """True if the plant's true state follows what the actor reads."""
+
     def __init__(self, observation_space: Any, *others: Any, interval: float = 5.0, **named: Any) -> None:
         self.width = observation_space.shape[-1]
-        known = layout(self.width)
+        known = layout(self.width, self.told)
         self.channels = len(known.sensed)
         """Number of channels that the environment shows."""
         self.interval = interval
@@ -133,6 +139,20 @@ class Asymmetric(BasePolicy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         """Arguments with which :meth:`load` makes the policy again."""
         return {**super()._get_constructor_parameters(), "interval": self.interval}
+
+
+class RememberingPolicy(Remembering, ActorCriticPolicy):
+    """The policy of stable-baselines3's PPO and A2C with a memory of hours; actor and critic read sensors alone."""
+
+    def make_features_extractor(self) -> BaseFeaturesExtractor:
+        """Make the scaling of the channels."""
+        return ScaledChannels(self.observation_space)
+
+
+class Asymmetric(Remembering):
+    """A policy whose critic reads the plant's true state behind what its actor sees."""
+
+    told = True
 
 
 class AsymmetricPolicy(Asymmetric, ActorCriticPolicy):
@@ -193,6 +213,20 @@ class StateCritic(ContinuousCritic):
 
 def _gains(channels: Sequence[Channel]) -> torch.Tensor:
     return torch.tensor([GAINS.get(each.name, 1.0) for each in channels])
+
+
+class ScaledChannels(BaseFeaturesExtractor):
+    """Features of a :class:`RememberingPolicy`: all channels, brought to the order of 1."""
+
+    gains: torch.Tensor
+
+    def __init__(self, space: Any) -> None:
+        super().__init__(space, space.shape[0])
+        self.register_buffer("gains", _gains(layout(space.shape[0], told=False).seen), persistent=False)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Scale observations (n, channels)."""
+        return observations * self.gains
 
 
 class StateEstimator(BaseFeaturesExtractor):

@@ -29,7 +29,7 @@ from cz_gym.support.command_line import OneLineParser, between
 from cz_gym.support.errors import require_type
 
 from .apg import APG, RecurrentPolicy
-from .asymmetric import Asymmetric
+from .asymmetric import Asymmetric, Remembering
 from .contract import AgentFileError, Contract, OnnxPolicy, facts_of, make_contract
 from .from_torch import export, largest_difference, write_validated
 from .recipes import JUDGING_SEEDS
@@ -75,7 +75,7 @@ def save_agent(
     config = config_of(model, config)
     _check_wrappers(model)
     wanted = (len(observations(config.process).get(config.observation, ())),), (2,)
-    read = (model.policy.channels,) if isinstance(model.policy, Asymmetric) else model.observation_space.shape
+    read = (model.policy.channels,) if isinstance(model.policy, Remembering) else model.observation_space.shape
     if (read, model.action_space.shape) != wanted:
         raise AgentFileError(
             f"the model reads an observation of shape {read} and gives an action of shape {model.action_space.shape}; "
@@ -169,7 +169,7 @@ class DeterministicActor(nn.Module):
         """The LSTM of sb3-contrib's recurrent policies."""
         if isinstance(policy, RecurrentPolicy):
             self.memory = policy.initial_memory(1).shape[1]
-        elif isinstance(policy, Asymmetric):
+        elif isinstance(policy, Remembering):
             self.memory = len(policy.means.keep)
         elif self.lstm is not None:
             if self.lstm.num_layers > 1:
@@ -192,7 +192,7 @@ class DeterministicActor(nn.Module):
         if isinstance(policy, RecurrentPolicy):
             action, *after = policy(x, *state)
             return (action.clamp(-1.0, 1.0), *after)
-        if isinstance(policy, Asymmetric):
+        if isinstance(policy, Remembering):
             x, *after = policy.look(x, *state)
         if isinstance(policy, ActorCriticPolicy):
             x = _features(policy.pi_features_extractor, x)
@@ -240,7 +240,7 @@ def to_agent(
     policy, env = algorithm.policy, algorithm.get_env()
     loop = None if env is None else unwrap_vec_wrapper(env, AddToController)
     residual: Residual | None = None if loop is None else loop.residual
-    if isinstance(policy, Asymmetric):
+    if isinstance(policy, Remembering):
         policy.check_interval(config)
     width = len(observations(config.process)[config.observation]) + (residual.width if residual else 0)
     content = to_onnx(policy, width, normalisation)

@@ -30,7 +30,7 @@ from cz_gym.sb3 import ActionRepeat, AddToController, CzVecEnv, LongMemory
 from cz_gym.support.errors import CzError, require_type
 
 from . import apg
-from .asymmetric import AsymmetricPolicy, AsymmetricSACPolicy
+from .asymmetric import AsymmetricPolicy, AsymmetricSACPolicy, RememberingPolicy
 from .contract import Contract, OnnxPolicy
 from .residual import Base, Residual
 
@@ -194,7 +194,7 @@ class PPO(Reinforcement):
 
     name: str = "ppo"
     hidden: tuple[int, ...] = (32, 32)
-    steps: int = 64_000_000
+    steps: int = 144_000_000
     action: str = "rate"
     """The heater's place on a puller whose meters err is kept by standing still; "smooth" must hold it by a reading."""
     num_envs: int = 1024
@@ -261,8 +261,8 @@ class SAC(Reinforcement):
 
 
 _learned_std: dict[str, Any] = {"num_envs": 2048, "batch_size": 2048, "log_std_init": -0.7, "learn_std": True}
-PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64), action="smooth", **_learned_std)
-"""stable-baselines3's own PPO, told nothing: beside ``ppo`` it shows what the true state is worth in training."""
+PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64), steps=96_000_000)
+"""Told nothing: beside ``ppo`` it shows what the true state is worth in training."""
 RECIPES: dict[str, TrainingConfig] = {
     recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG(), PPOResidual(**_learned_std))
 }
@@ -273,7 +273,7 @@ _along: dict[str, Any] = {
     "scenario": "randomized=0.5,hard=0.5",
 }
 CRYSTAL_RECIPES: dict[str, TrainingConfig] = {
-    "ppo": PPO(name="ppo-along", action="smooth", **_learned_std, **_along),
+    "ppo": PPO(name="ppo-along", steps=64_000_000, action="smooth", **_learned_std, **_along),
     "gradient": APG(name="gradient-along", units=64, steps=17_280_000, **_along),
 }
 """Recipes of CzCrystal-v0: one agent for crown, body and tail."""
@@ -297,7 +297,7 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base 
             kind, policy = apg.APG, "RecurrentPolicy"
             options = {"betas": recipe.betas, "units": recipe.units, "hidden": recipe.units}
         case PPO():
-            kind, policy, critics = stable_baselines3.PPO, AsymmetricPolicy if told else "MlpPolicy", "vf"
+            kind, policy, critics = stable_baselines3.PPO, AsymmetricPolicy if told else RememberingPolicy, "vf"
             options = {"log_std_init": recipe.log_std_init}
         case SAC():
             kind, policy, critics = stable_baselines3.SAC, AsymmetricSACPolicy, "qf"
@@ -308,7 +308,7 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base 
     settings = {name: getattr(recipe, name) for name in asdict(recipe) if name in known}
     if isinstance(recipe, Reinforcement):
         settings["learning_rate"] = partial(linear_schedule, recipe.learning_rate)
-        options |= {"interval": recipe.config.control_interval} if told else {}
+        options["interval"] = recipe.config.control_interval
         options["net_arch"] = {"pi": list(recipe.hidden), critics: list(recipe.critic_hidden)}
     if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer
         settings["learning_starts"] += done // recipe.action_repeat
@@ -331,7 +331,7 @@ def _environment(recipe: TrainingConfig, stagger: int, base: Base | None) -> Vec
     info: Any = "all" if recipe.told else "lean"
     batch = CzVectorEnv.from_config(recipe.config, recipe.num_envs, AutoresetMode.SAME_STEP, info=info)
     env: VecEnv = CzVecEnv(batch, stagger, critic_state=recipe.told)
-    env = LongMemory(env) if recipe.told else env
+    env = LongMemory(env)
     if isinstance(recipe, PPOResidual):
         env = AddToController(env, Residual(require_type(Base, base, "it is added to"), *recipe.limits))
     return VecNormalize(ActionRepeat(env, recipe.action_repeat), norm_obs=False, gamma=recipe.gamma)
