@@ -15,11 +15,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from cz_gym import CzEnv, CzVectorEnv
 from cz_gym.agents import OnnxPolicy
-from cz_gym.agents.asymmetric import AsymmetricPolicy, AsymmetricSACPolicy, LearnState
+from cz_gym.agents.asymmetric import AsymmetricPolicy, AsymmetricSACPolicy, LearnState, RememberingPolicy
 from cz_gym.agents.from_sb3 import save_agent
 from cz_gym.body.process import BODY
 from cz_gym.crystal.process import CRYSTAL
-from cz_gym.sb3 import LONG, LongMeans, environment_steps, long_channels, make_vec_env
+from cz_gym.sb3 import LONG, LongMeans, LongMemory, environment_steps, long_channels, make_vec_env
 from cz_gym.spaces import observations
 from cz_gym.support.errors import CzError
 
@@ -160,6 +160,32 @@ def test_gymnasiums_wrapper_counts_the_episodes_of_both_forms(form):
     assert ends >= 16
 
 
+def remembers_what_the_batch_shows(model, env, agent):
+    """A policy and its file keep the means over hours that a batch in a LongMemory shows."""
+    shown, state, memory, begins = env.reset(), None, None, np.ones(N, bool)
+    channels = model.policy.channels
+    for _ in range(30):
+        action, _ = model.predict(shown, deterministic=True)
+        own, state = model.predict(shown[:, :channels], state, begins, deterministic=True)
+        filed, memory = agent.predict(shown[:, :channels], memory, begins)
+        np.testing.assert_allclose(own, action, atol=1e-5)
+        np.testing.assert_allclose(filed, action, atol=1e-5)
+        shown, _, begins, _ = env.step(action)
+
+
+def test_a_policy_that_is_told_nothing_remembers_hours_too(tmp_path):
+    env = LongMemory(adapter())
+    kept = {"policy_kwargs": {"interval": 20.0}, "n_steps": 8, "batch_size": 24, "seed": 0, "device": "cpu"}
+    model = PPO(RememberingPolicy, env, **kept).learn(48)
+    assert save_agent(tmp_path / "agent.onnx", model, "remembering").learned_from == "reward"
+    remembers_what_the_batch_shows(model, env, OnnxPolicy.load(tmp_path / "agent.onnx"))
+    model.save(tmp_path / "model.zip")
+    again, seen = PPO.load(tmp_path / "model.zip", device="cpu"), env.reset()
+    np.testing.assert_array_equal(*(each.predict(seen, deterministic=True)[0] for each in (again, model)))
+    with pytest.raises(CzError, match=r"reads means over hours: cz_gym.sb3.LongMemory\(make_vec_env"):
+        PPO(RememberingPolicy, adapter(), n_steps=8, batch_size=24, device="cpu")
+
+
 def judge(model, seen, action):
     """What a model's critic says of observations, shape (n, 1)."""
     return model.critic(seen, action)[0] if isinstance(model, SAC) else model.policy.predict_values(seen)
@@ -173,7 +199,6 @@ def test_a_critic_may_read_the_true_state_that_no_actor_reads(tmp_path):
     seen_by_actor = plain.observation_space.shape[0] + len(long_channels(BODY))
     plain.seed(5)
     told.seed(5)
-    channels = plain.observation_space.shape[0]
     history, memory = plain.reset(), np.zeros((N, len(means.keep)), np.float32)
     over_hours, memory = means.after(history, memory)
     np.testing.assert_array_equal(told.reset(), np.hstack([history, over_hours, states.reset(seed=5)[0]]))
@@ -205,15 +230,7 @@ def test_a_critic_may_read_the_true_state_that_no_actor_reads(tmp_path):
             values = [judge(model, torch.tensor(each), torch.tensor(action)) for each in (seen, other_state)]
         assert (values[0] != values[1]).all()
         assert save_agent(tmp_path / "agent.onnx", model, "asymmetric").learned_from == "state"
-        agent, shown = OnnxPolicy.load(tmp_path / "agent.onnx"), told.reset()
-        state, memory, begins = None, None, np.ones(N, bool)
-        for _ in range(30):  # the policy and the file keep the means that the batch shows
-            action, _ = model.predict(shown, deterministic=True)
-            own, state = model.predict(shown[:, :channels], state, begins, deterministic=True)
-            filed, memory = agent.predict(shown[:, :channels], memory, begins)
-            np.testing.assert_allclose(own, action, atol=1e-5)
-            np.testing.assert_allclose(filed, action, atol=1e-5)
-            shown, _, begins, _ = told.step(action)
+        remembers_what_the_batch_shows(model, told, OnnxPolicy.load(tmp_path / "agent.onnx"))
     with pytest.raises(ValueError, match="needs observation='history'"):
         adapter(observation="measured", critic_state=True)
     sac.learn(24, LearnState())
