@@ -1,10 +1,10 @@
-"""Policies of stable-baselines3 that are told the plant's true state while they learn; what they act on is sensors.
+"""Policies of stable-baselines3 that remember hours; most are told the plant's true state while they learn.
 
-For a :class:`cz_gym.sb3.CzVecEnv` with ``critic_state``. Critics read the state; actors read an estimate of it, which
-the callback :class:`LearnState` fits by regression:
-``PPO(AsymmetricPolicy, make_vec_env(1024, critic_state=True)).learn(steps, LearnState())``. ``predict`` takes the
-observations of the environment as it is, and keeps the means over hours that the batch shows in a memory. Needs
-stable-baselines3.
+What they act on is sensors, and means of these over hours (:class:`cz_gym.sb3.LongMemory`). ``predict`` takes the
+observations of the environment as it is, and keeps the means in a memory. Those that are told learn in a
+:class:`cz_gym.sb3.CzVecEnv` with ``critic_state``. Their critics read the state; their actors read an estimate of it,
+which the callback :class:`LearnState` fits by regression:
+``PPO(AsymmetricPolicy, make_vec_env(1024, critic_state=True)).learn(steps, LearnState())``. Needs stable-baselines3.
 """
 
 from collections.abc import Sequence
