@@ -241,7 +241,8 @@ def nested():
 
 
 IN_LITTLE_MEMORY = """
-import json, resource, sys
+import ctypes, json, resource, sys
+ctypes.CDLL(None).mallopt(-8, 1)  # glibc's M_ARENA_MAX: each thread's own pool would reserve 128 MB of the limit
 import onnxruntime, onnx.checker
 sys.path[:0] = ["."]
 from tests.agents import test_graph as t
