@@ -449,7 +449,9 @@ def test_crystals_that_judge_neither_select_nor_test():
     assert not judged & (set(recipes.SELECTION_SEEDS) | set(TEST_SEEDS))
 
 
-@pytest.mark.parametrize("scenario", ["randomized", "randomized=0.4,hard=0.2,puller=0.4"])
+@pytest.mark.parametrize(
+    "scenario", ["randomized", pytest.param("randomized=0.4,hard=0.2,puller=0.4", marks=pytest.mark.slow)]
+)
 def test_a_reference_has_its_design_for_each_crystal(scenario, monkeypatch):
     monkeypatch.setattr(recipes, "SELECTION_SEEDS", SEEDS)
     monkeypatch.setattr(recipes, "JUDGING_SEEDS", SEEDS[:1])

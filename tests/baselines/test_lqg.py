@@ -249,12 +249,14 @@ ADAPTIVE = [each.name for each in CONTROLLERS if each.name.endswith("-adaptive")
 SLOW_CASES = [pytest.param(name, marks=pytest.mark.slow) for name in (*FAMILY[1:-1], *ADAPTIVE)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lqg", FAMILY[0], FAMILY[-1], *SLOW_CASES])
 def test_no_lqg_loses_a_crystal(name):
     config = make_config("hot-zone", **PLAIN)
     assert not rollout(make_controller(name, config), config, CRYSTALS).failed.any()
 
 
+@pytest.mark.slow
 def test_an_lqg_tuned_on_nominal_hot_zones_loses_crystals_of_others_unless_it_knows_them():
     over = replace(SCENARIOS["hot-zone"].pullers, boundary_layer=(0.0, 0.0))
     config = make_config(replace(SCENARIOS["hot-zone"], pullers=over, told=Told()), **PLAIN)
@@ -262,6 +264,7 @@ def test_an_lqg_tuned_on_nominal_hot_zones_loses_crystals_of_others_unless_it_kn
     assert not rollout(privileged(NOMINAL_LQG, knows_fluctuations=False), config, CRYSTALS).failed.any()
 
 
+@pytest.mark.slow
 def test_one_design_serves_every_scenario_and_loses_no_crystal():
     """The design is the same whatever scenario it is asked for."""
     configs = [make_config(name, **PLAIN) for name in ("randomized", "puller", "hot-zone", "all")]
@@ -303,6 +306,7 @@ def test_the_bank_weights_its_filters_by_bayes_rule():
     assert state.mean[0] == pytest.approx(state.probability[0] @ state.filters.mean[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("strength", "factor"), [(0.05, 0.2), (0.5, 1.0)])
 def test_the_adaptive_lqg_estimates_how_strong_the_fluctuations_are(strength, factor):
     """After an hour nine of ten crystals are at the nearest hypothesis; the design is that for known hot zones."""
@@ -350,6 +354,7 @@ def test_each_filter_has_the_noise_of_its_own_crystal():
         np.testing.assert_allclose(known[slot], plant_model(puller, noise, config.control_interval).Q, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [("lqg-at-0.02", "lqg-at-0.02-privileged"), ("lqg", "full-information")])
 def test_knowing_more_lowers_the_error_and_the_regulator_s_own_cost_on_the_same_episodes(names):
     """The puller and its fluctuations, or the whole state. Of activity nothing follows: who knows more may use it."""

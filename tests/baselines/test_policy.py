@@ -156,7 +156,7 @@ def test_who_runs_on_a_puller_unless_controllers_are_named():
 TUNED = ("pid-conventional", "paper-filtered", "paper-tuned", "lqg")
 
 
-@pytest.mark.parametrize("name", TUNED)
+@pytest.mark.parametrize("name", [*TUNED[:3], pytest.param(TUNED[3], marks=pytest.mark.slow)])
 def test_every_control_interval_holds_the_radius_alike(name):
     configs = [make_config("randomized", control_interval=dt, horizon=5400.0, **PLAIN) for dt in (5.0, 2.0, 10.0)]
     found = [metrics(rollout(make_controller(name, config), config, range(8))) for config in configs]

@@ -165,6 +165,7 @@ def test_what_was_found_is_used_for_that_puller_alone(tmp_path):
             make_controller("paper-tuned", config)
 
 
+@pytest.mark.slow
 def test_one_command_designs_and_another_runs_it(tmp_path, monkeypatch, capsys):
     place = tmp_path / "mine.toml"
     write_puller(find_puller("silicon-300mm"), place)

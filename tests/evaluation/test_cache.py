@@ -180,6 +180,7 @@ def test_slow_controllers_run_only_when_asked_for(small, refused):
         assert "clairvoyant" in taking_part([*wanted, "--slow"])
 
 
+@pytest.mark.slow
 def test_all_takes_those_that_are_cached_and_names_the_others(small, capsys):
     everyone = ["--controllers", "all", "--episodes", "2"]
     nominal = ["--scenarios", "nominal", "--json", str(small / "all.json")]

@@ -348,7 +348,13 @@ def test_one_s_own_controller_runs_beside_a_few_into_its_own_folder(tmp_path, mo
     assert folders == [Path("runs/later-some")]
 
 
-@pytest.mark.parametrize("method", ["spawn", pytest.param("fork", marks=pytest.mark.skipif("sys.platform == 'win32'"))])
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param("spawn", marks=pytest.mark.slow),
+        pytest.param("fork", marks=pytest.mark.skipif("sys.platform == 'win32'")),
+    ],
+)
 def test_everything_of_a_benchmark_passes_to_other_processes_as_a_value(method, tmp_path, monkeypatch):
     """Controllers, agents, and code of one's own, which another process reads from its file again."""
     monkeypatch.chdir(tmp_path)

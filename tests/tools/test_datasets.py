@@ -175,6 +175,7 @@ def test_only_training_seeds_are_recorded(seeds):
     assert not set(VALIDATION_SEEDS) & set(TRAINING_SEEDS)
 
 
+@pytest.mark.slow
 def test_a_dataset_is_replaced_only_when_asked_for_and_never_left_half(place, monkeypatch, capsys):
     monkeypatch.setattr(datasets, "reference_scores", cache(datasets.reference_scores))
     command = ["--policies", "paper", "--scenarios", "nominal", "--episodes", "1", "--out", str(place)]

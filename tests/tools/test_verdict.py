@@ -306,6 +306,7 @@ def test_tables_and_sentences_fit_the_terminal(columns, monkeypatch):
     assert blocks == text.count("\n  gradient ") == (4 if columns == 80 else 2)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_figures_of_a_crystal_that_nothing_disturbs_and_of_a_name_that_seems_a_formula():
     parts = []

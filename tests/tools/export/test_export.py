@@ -138,10 +138,11 @@ def test_an_exported_agent_acts_as_onnxruntime_does(name):
         seen, measured = own.step(np.asarray(action))[0], env.step(np.asarray(action))[0]
 
 
-FAST = [("paper-tuned", "puller"), ("gradient", "puller"), ("lqg-at-0.02", "sensor-fault")]  # one of each kind
+FAST = [("paper-tuned", "puller")]
 ELSEWHERE = {"lqg-robust": "randomized"}  # it was tuned there alone
 SLOW = [(name, ELSEWHERE.get(name, "puller")) for name in (*CLASSICAL, "fallback", *agents.shipped_names())]
-SLOW = [case for case in (*SLOW, ("lqg", "sensor-fault"), ("lqg", "randomized")) if case not in FAST]
+ON_OTHERS = [("lqg", "sensor-fault"), ("lqg", "randomized"), ("lqg-at-0.02", "sensor-fault")]
+SLOW = [case for case in (*SLOW, *ON_OTHERS) if case not in FAST]
 
 
 @needs_compiler
@@ -287,6 +288,7 @@ def grown(fault):
     return grow(block_of("paper-tuned"), fault, 3, in_language(CompiledBlock, "paper-tuned"), 5400.0)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("fault", ["heater reads 1.03", "drives read wrong, draw 1", "ring steps by -2 mm"])
 def test_readings_that_err_cost_no_radius(fault):
@@ -295,6 +297,7 @@ def test_readings_that_err_cost_no_radius(fault):
     assert row.rmse < 1.2 * exact.rmse
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_stuck_ring_costs_no_crystal_and_its_controller_comes_back_without_a_bump():
     """A filter follows the crystal while the PID controls; one that began anew would take the heater for wrong."""
@@ -671,7 +674,9 @@ def test_without_a_pyrometer_the_heater_holds_and_a_bit_says_so(runner, reading)
     assert Alarm.PYROMETER not in plant.alarms(T_1_K=T_1 + 0.5)
 
 
-@pytest.mark.parametrize(("name", "to", "files"), [("lqg-at-0.02", "c", 4), ("ppo", "st", 3)])
+@pytest.mark.parametrize(
+    ("name", "to", "files"), [pytest.param("lqg-at-0.02", "c", 4, marks=pytest.mark.slow), ("ppo", "st", 3)]
+)
 def test_the_command_writes_a_folder(name, to, files, tmp_path):
     assert main([name, "--to", to, "--out", str(tmp_path)]) == 0
     assert len(list(tmp_path.iterdir())) == files
@@ -800,6 +805,7 @@ def test_the_structured_text_is_of_the_standard(name):
     assert len(sample.statements.statements) > (100 if name else 10)
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.usefixtures("one_search")
 def test_blocks_for_two_pullers_and_scenarios_stand_in_one_program(tmp_path):

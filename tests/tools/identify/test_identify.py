@@ -194,6 +194,7 @@ def test_material_constants_have_the_priors_of_handbooks(found):
     assert found.puller.fluctuation_sd is not None
 
 
+@pytest.mark.slow
 def test_a_log_of_a_controller_alone_tells_nothing(logs):
     passive = identify(read_log(logs[1]))
     assert max(passive.excitation) < 0.5
@@ -390,6 +391,7 @@ def test_a_model_that_does_not_fit_is_no_result(logs, found, tmp_path, monkeypat
     assert read_puller(out).hash == found.puller.hash
 
 
+@pytest.mark.slow
 def test_the_example_goes_from_a_log_to_a_controller(logs, found, tmp_path, monkeypatch):
     monkeypatch.setattr(example, "identify", lambda *_: found)
     out = tmp_path / "my.toml"

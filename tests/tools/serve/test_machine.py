@@ -177,6 +177,7 @@ def test_an_error_in_the_clock_reaches_whoever_waits():
     assert isinstance(clock.error, ZeroDivisionError)
 
 
+@pytest.mark.slow
 def test_a_crown_without_setpoints_completes_under_the_fallback_and_goes_on_from_its_state(tmp_path):
     file = StateFile(tmp_path / "state")
 

@@ -386,7 +386,7 @@ needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="cc is no
 @pytest.mark.parametrize(
     ("name", "scenario", "options", "steps"),
     [
-        ("paper", "randomized", (), 200),
+        pytest.param("paper", "randomized", (), 200, marks=pytest.mark.slow),
         ("ppo", "puller", (), 100),
         pytest.param("gradient", "puller", ("--compiled",), 200, marks=(needs_compiler, pytest.mark.slow)),
         pytest.param("paper", "randomized", (), 2160, marks=pytest.mark.slow),
