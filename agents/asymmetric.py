@@ -69,8 +69,9 @@ class Layout(NamedTuple):
 
 @cache
 def layout(width: int, told: bool = True) -> Layout:
-    """Find the environment whose "history", means over hours and, if ``told``, true state have that many channels;
-    CzError if none has."""
+    """Find the environment whose "history" and means over hours have that many channels, with the true state if
+    ``told``; CzError if none has.
+    """
     for process, added in product(ENVIRONMENTS.values(), ((), ADDED)):
         unknown = [i for i, each in enumerate(process.state) if each not in process.measured]
         known = Layout(process, added, len(added) + len(process.measured) + 1, unknown)
