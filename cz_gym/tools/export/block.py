@@ -72,6 +72,9 @@ class Alarm(IntFlag):
     """The ring has jumped by more than a crystal can; once it has stayed there, its old place is its new one."""
     RADIUS = 131072
     """The ring has been farther than ``radius_limit_mm`` from the reference for ``radius_limit_s``."""
+    CAMERA_CLOCK = 262144
+    """The ring changes, but for a minute its time has been in the future or older than ``oldest_reading_s``: the
+    camera's clock is wrong, see ``camera_clock_s``, or its readings come late."""
 
 
 def meanings(kind: Any) -> dict[Any, str]:
@@ -159,6 +162,9 @@ def settings_of(config: Config, puller: Puller | None = None) -> tuple[Port, ...
         Port("takeover_s", "time from a takeover to the controller's full authority", 120.0),
         Port("fallback_after_s", "time without good readings after which the PID takes over", 240.0),
         Port("oldest_reading_s", "age from which a ring reading counts as stale", latency + 3.0 * interval),
+        Port(
+            "camera_clock_s", "time by which the camera's clock is ahead of the block's, as ring_time_s shows it", 0.0
+        ),
         Port("gap_s", "time without a call after which the next one is a takeover", max(10.0 * interval, 30.0)),
         Port("return_after_s", "time of good readings near nominal after which a PID gives way; 0: never", 1200.0),
         Port("ring_step_mm", "change of the ring that no crystal makes in a sample", step),
@@ -308,6 +314,8 @@ class Memory(NamedTuple):
     """Mean of a step that has not yet stayed [m]."""
     ring_step_time: Any
     """Time for which the step has stayed [s]."""
+    misdated_time: Any
+    """Time for which a ring that changes has had a time that cannot be [s]."""
     radius_time: Any
     """Time for which the radius has been beyond its limit [s]."""
     readings: Measured
@@ -375,6 +383,7 @@ class Ring(NamedTuple):
     offset: Any
     step: Any
     step_time: Any
+    misdated_time: Any
 
 
 def ring_of(
@@ -386,11 +395,14 @@ def ring_of(
     as one of the camera, and is taken off. In ``manual`` no jump is questioned.
     """
     dt, pace, anew = constants.dt, -math.expm1(-constants.dt / RING_TIME), manual | call.starts
-    age, place = given["time_s"] - given["ring_time_s"], seen.ring_error + seen.r_ref
+    age, place = given["time_s"] + given["camera_clock_s"] - given["ring_time_s"], seen.ring_error + seen.r_ref
     same = ~call.starts & (np.abs(place - memory.last_ring) <= STILL_RING)
     still_time = np.where(same, memory.ring_still_time + np.where(call.later, 0.0, dt), 0.0)
     alive = still_time <= given["ring_still_s"]
-    read = plausible & (seen.valid > 0.5) & (np.abs(age) <= given["oldest_reading_s"]) & alive
+    looks, timely = plausible & (seen.valid > 0.5) & alive, np.abs(age) <= given["oldest_reading_s"]
+    read, misdated = looks & timely, looks & ~(timely & (age >= -0.5 * dt))
+    longer = memory.misdated_time + np.where(call.later, 0.0, dt)
+    misdated_time = np.where(same, memory.misdated_time, np.where(misdated, longer, 0.0))
     offset = np.where(anew, 0.0, memory.ring_offset)
     known, gap = ~anew & finite(memory.ring_level), place - offset - memory.ring_level
     largest = given["ring_step_mm"] * MM + RING_GROWTH * memory.no_ring_time
@@ -407,6 +419,7 @@ def ring_of(
     return Ring(
         good, seen.ring_error - offset, stepped, np.where(finite(place), place, np.inf), still_time,
         np.where(read | anew, 0.0, memory.no_ring_time + dt), level, offset, step, np.where(stays, 0.0, step_time),
+        misdated_time,
     )  # fmt: skip
 
 

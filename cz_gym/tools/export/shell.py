@@ -53,8 +53,8 @@ NO_PYROMETER_TIME = MINUTE
 """Time for which a controller that estimates the temperature keeps the heater without a pyrometer [s]."""
 NO_RING_TIME = 15.0
 """Time without a ring after which a controller that does not observe gives the pull speed to its nominal value [s]."""
-DRIVE_ERROR_TIME = MINUTE
-"""Time after which a drive counts as not following [s]."""
+DRIVE_ERROR_TIME, MISDATED_TIME = MINUTE, MINUTE
+"""Time after which a drive counts as not following, and the camera's clock as wrong [s]."""
 PULL_BIAS_TIME, TRIM_T_1, TRIM_Q_H = 5.0 * MINUTE, 0.5, 0.005
 """Averaging time of the pull speed [s]; what a takeover leaves of the deviation from the nominal temperature [K] and
 power [share of the heater's range]. The rest counts as an error of the nominal values."""
@@ -206,6 +206,7 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
         Alarm.MANUAL: ~engaged, Alarm.SETTINGS: ~sane, Alarm.ASTRAY: lost, Alarm.MODEL: duty.mismatch,
         Alarm.READING_ERROR: reading_error_time > READING_ERROR_TIME, Alarm.RING_STEP: seen.ring.stepped,
         Alarm.RADIUS: radius_time > given["radius_limit_s"],
+        Alarm.CAMERA_CLOCK: seen.ring.misdated_time > MISDATED_TIME,
     }  # fmt: skip
     alarms = reduce(add, (np.where(holds, float(bit), 0.0) for bit, holds in bits.items()))
     errors = (np.where(runs, each.error, 0.0) for each in drives)
@@ -229,7 +230,8 @@ def step(controller: Controller, pid: Controller, constants: PullerConstants, gi
         reading_error_time=reading_error_time, pull_limited=sides[0], heater_limited=sides[1],
         good_time=duty.good_time, stays=stays, last_ring=seen.ring.last, ring_still_time=seen.ring.still_time,
         no_ring_time=seen.ring.gone_time, ring_level=seen.ring.level, ring_offset=seen.ring.offset,
-        ring_step=seen.ring.step, ring_step_time=seen.ring.step_time, radius_time=radius_time,
+        ring_step=seen.ring.step, ring_step_time=seen.ring.step_time, misdated_time=seen.ring.misdated_time,
+        radius_time=radius_time,
         readings=seen.read, controller=control.own, pid=control.pid,
     )  # fmt: skip
     return outputs, now, call.due, call.again

@@ -577,6 +577,27 @@ def test_each_reading_has_its_alarm_and_is_held(given, alarm):
     assert plant.alarms() == twin.alarms() == 0
 
 
+@pytest.mark.parametrize(
+    ("ahead", "bits"),
+    [
+        (0.0, 0),
+        (5.0, Alarm.CAMERA_CLOCK),
+        (-15.0, 0),
+        (-30.0, Alarm.CAMERA_CLOCK | Alarm.RING),
+        (300.0, Alarm.CAMERA_CLOCK | Alarm.RING),
+    ],
+)
+def test_a_wrong_clock_of_the_camera_raises_a_bit_and_a_setting_corrects_it(ahead, bits):
+    plant, corrected = Plant(), Plant(camera_clock_s=ahead)
+    ring, shown = plant.block.ports["ring_bias_mm"].default + plant.block.ports["nominal_radius_mm"].default, Alarm(0)
+    for k in range(20):
+        frame = {"ring_time_s": plant.time + 5.0 + ahead, "ring_radius_mm": ring + 0.01 * (k % 3)}
+        shown = plant.alarms(**frame)
+        assert Alarm.CAMERA_CLOCK not in shown or k >= 12
+        assert corrected.alarms(**frame) & ~Alarm.TAKEOVER == 0
+    assert shown == bits
+
+
 def test_the_clock_is_watched_and_no_sample_is_taken_twice():
     plant = Plant()
     for _ in range(20):
