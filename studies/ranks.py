@@ -1,8 +1,8 @@
 """Ranks of controllers under the plant's estimates, and what any of them could reach: ``python -m studies.ranks``.
 
-Each estimate is moved alone, on the same crystals, with the controllers and agents of the README's table as they are.
-Kendall's tau compares the order of their radius errors with that of ``randomized``. The limit is the error of the best
-linear controller on the linear plant, told all of it, that moves the pull as much as the README's LQG.
+Each estimate is moved alone, on the same crystals, with the controllers and agents of README's plot as they are.
+Kendall's tau compares their order, by crystals lost and then by cost, with that of ``randomized``. The limit is the
+error of the best linear controller on the linear plant, told all of it, that moves the pull as much.
 """
 
 import argparse
@@ -35,9 +35,9 @@ from cz_gym.tools.report.tables import markdown
 from . import StudyParser
 from .robustness import policy_and_config
 
-CONTROLLERS = ("paper", "paper-filtered", "paper-tuned", "lqg-at-0.02", "lqg-one-design", "gradient", "ppo", "sac",
-               "ppo-plain")  # fmt: skip
-"""Controllers of the README's table, the paper's with a filter, and agents by their seed of least validation cost."""
+CONTROLLERS = ("paper", "paper-filtered", "paper-tuned", "lqg", "lqg-at-0.02", "lqg-one-design", "gradient", "ppo",
+               "sac", "ppo-plain")  # fmt: skip
+"""Controllers of README's plot, and agents by their seed of least validation cost."""
 FLUCTUATION, CAMERA, PYROMETER = 0.29, 0.029 * MM, 0.058
 """Root mean squares of each fluctuation [K], of the camera's [m] and of the pyrometer's noise [K] on ``randomized``."""
 FIXED = Scenario(
@@ -51,7 +51,10 @@ NOISES = (0.005 * MM, 0.015 * MM, CAMERA, 0.06 * MM, 0.12 * MM)
 GAINS = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Factors on the ring's gain to the meniscus height: the zero moves inversely."""
 ACTIVITY = 0.02 * MM_PER_MIN
-"""Pull step RMS of the limit's regulator [m/s]: that of the README's LQG."""
+"""Pull step RMS of the regulator of the table of limits [m/s]: that of ``lqg-at-0.02``."""
+CHEAPEST, DEAREST = -4.0, 4.0
+"""Decimal logarithms of the least and the largest price of the regulator's moves: at the least, more moves gain
+nothing."""
 HELD = 1e-4
 """Price of the drives' squares [1/(mm/min)^2, 1/kW^2]: what returns them to nominal."""
 
@@ -169,13 +172,14 @@ def _stationary(A: Any, Q: Any) -> Any:
     return Q
 
 
-def limit(puller: Puller, camera: float, gain: float = 1.0) -> float:
-    """Least error [m] at this noise of the camera [m] with pull steps of :data:`ACTIVITY`."""
+def limit(puller: Puller, camera: float, gain: float = 1.0, activity: float = ACTIVITY) -> float:
+    """Least error [m] at this noise of the camera [m] with pull steps of at most ``activity`` [m/s], RMS."""
 
     def excess(exponent: float) -> float:
-        return float(np.log(linear_error(puller, camera, gain, 10.0**exponent)[1] / ACTIVITY))
+        return float(np.log(linear_error(puller, camera, gain, 10.0**exponent)[1] / activity))
 
-    return linear_error(puller, camera, gain, 10.0 ** brentq(excess, -4.0, 4.0, xtol=1e-3))[0]
+    price = CHEAPEST if excess(CHEAPEST) <= 0.0 else brentq(excess, CHEAPEST, DEAREST, xtol=1e-3)
+    return linear_error(puller, camera, gain, 10.0**price)[0]
 
 
 def zero_of(gain: float) -> float:
@@ -189,13 +193,17 @@ def zero_of(gain: float) -> float:
 # What is written
 
 
+def places(found: Mapping[str, Any]) -> list[int]:
+    """The place of each controller, as the README ranks: by crystals lost, then by cost."""
+    keys = [(each.failure_rate.sum(), each.cost.mean()) for each in found.values()]
+    return [sorted(keys).index(key) for key in keys]
+
+
 def ranked(moved: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
     """Rows of the table: variant, tau, errors [mm], lost crystals."""
-    base = list(next(iter(moved.values())).values())
-    rows = []
+    base, rows = places(next(iter(moved.values()))), []
     for about, found in moved.items():
-        here = [each.rmse_mm.mean() for each in found.values()]
-        tau = kendalltau([each.rmse_mm.mean() for each in base], here).statistic
+        here, tau = [each.rmse_mm.mean() for each in found.values()], kendalltau(base, places(found)).statistic
         lost = [f"{name} {int(each.failure_rate.sum())}" for name, each in found.items() if each.failure_rate.any()]
         rows.append((about, f"{tau:.2f}", *(f"{error:.3f}" for error in here), ", ".join(lost) or "none"))
     return rows
@@ -239,18 +247,20 @@ def _main(given: argparse.Namespace) -> None:
             name: errors(*policies[name], each.scenario, each.parameters, given.crystals) for name in names
         }
         print(*ranked(moved)[-1], flush=True)
-    least = limit(make_puller(lam=MIX), CAMERA)
-    distance = []
+    puller, distance = make_puller(lam=MIX), []
     for name in names:
         designed_for = replace(policies[name][1], model=MIX)
         found = errors(policies[name][0], designed_for, FIXED, Parameters(), given.crystals)
         error, step = found.rmse_mm.mean(), found.pull_step_rms_mm_per_min.mean()
-        distance.append((name, f"{error:.4f}", f"{error * MM / least:.2f}", f"{step:.4f}"))
+        least = limit(puller, CAMERA, activity=step * MM_PER_MIN) / MM
+        distance.append((name, f"{step:.4f}", f"{error:.4f}", f"{least:.4f}", f"{error / least:.2f}"))
     text = f"""# Ranks under the plant's estimates
 
 Radius error (RMSE) [mm] on {given.crystals} test crystals of three hours, one estimate moved at a time; the controllers
-stay as they are on `randomized`. A lost crystal counts 8 mm to its end. Kendall's tau compares the order of the errors
-with that of the first row: 1 is the same order, 0 no relation. An agent is its training seed of least validation cost.
+stay as they are on `randomized`. A lost crystal counts 8 mm to its end. Kendall's tau compares the order, by crystals
+lost and then by cost, with that of the first row: 1 is the same order, 0 no relation. Two controllers that hold nearly
+alike may change places by chance: each such pair lowers tau by {4.0 / max(len(names) * (len(names) - 1), 1):.2f}. An
+agent is its training seed of least validation cost.
 
 {markdown(("estimate", "tau", *names, "lost"), ranked(moved))}
 
@@ -259,15 +269,16 @@ with that of the first row: 1 is the same order, 0 no relation. An agent is its 
 ## The limit
 
 Least stationary radius error [mm] of a linear controller that knows the plant (half conduction, no layer) and meets
-nothing but two fluctuations of {FLUCTUATION:g} K and the noise of camera and pyrometer. Its pull steps are
-{ACTIVITY / MM_PER_MIN:g} mm/min RMS: a controller that moves less has more error for that alone. The ring's gain to the
-height moves the zero, which is at {zero_of(1.0):.4f} rad/s by default:
+nothing but two fluctuations of {FLUCTUATION:g} K and the noise of camera and pyrometer. Here its pull steps are
+{ACTIVITY / MM_PER_MIN:g} mm/min RMS. The ring's gain to the height moves the zero, which is at {zero_of(1.0):.4f} rad/s
+by default:
 
 {limits_table()}
 
-Each controller on such crystals, with {1e3 * CAMERA / MM:g} µm of camera noise, where the limit is {least / MM:.4f} mm:
+Each controller on such crystals, with {1e3 * CAMERA / MM:g} µm of camera noise, beside the limit for pull steps as
+large as its own: one that moves less has a larger error for that alone.
 
-{markdown(("controller", "error [mm]", "times the limit", "pull step RMS [mm/min]"), distance)}
+{markdown(("controller", "pull step RMS [mm/min]", "error [mm]", "limit [mm]", "times the limit"), distance)}
 """
     write_files({given.out / "table.md": text.encode(), given.out / "ranks.png": figure(moved)})
 

@@ -74,8 +74,8 @@ class Style(NamedTuple):
     dashes: tuple[float, ...]
 
 
-def _style(colour: int, mark: str) -> Style:
-    return Style(COLOURS[colour], mark, DASHES[colour])
+def _style(colour: int, mark: str, dashes: int | None = None) -> Style:
+    return Style(COLOURS[colour], mark, DASHES[colour if dashes is None else dashes])
 
 
 STYLES = {
@@ -95,13 +95,13 @@ STYLES = {
     "true-radius": _style(6, "cross"),
     "gradient-along": _style(3, "diamond"),
     "ppo-along": _style(4, "tall diamond"),
-    "open-loop": _style(7, "pentagon"),
-    "pid-uncompensated": _style(6, "cross"),
-    "pid-conventional": _style(4, "bar"),
-    "paper-filtered": _style(1, "sun")._replace(dashes=DASHES[6]),  # of one family with paper
-    "lqg": _style(6, "bar"),
-    "lqg-quiet": _style(7, "sun"),
-    "lqg-at-0.02-adaptive": _style(0, "cross"),
+    "open-loop": _style(7, "pentagon", 1),
+    "pid-uncompensated": _style(6, "cross", 2),
+    "pid-conventional": _style(4, "bar", 0),
+    "paper-filtered": _style(1, "sun", 6),  # of one family with paper
+    "lqg": _style(6, "pentagon", 4),
+    "lqg-quiet": _style(7, "sun", 3),
+    "lqg-at-0.02-adaptive": _style(0, "cross", 4),
 }
 """Looks of the controllers in the project's figures; :func:`styles` has those of others."""
 

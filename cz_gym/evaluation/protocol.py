@@ -284,6 +284,12 @@ def find_case(name: str, cases: Sequence[Case] = CASES) -> Case:
     raise CzError(unknown_name_message("scenario", name, [case.name for case in cases]))
 
 
+def find_cases(name: str, cases: Sequence[Case] = CASES) -> list[Case]:
+    """Return the case of that name, or all those of the scenario of that name; CzError names the cases that exist."""
+    known, alike = {case.name for case in cases}, [case for case in cases if case.scenario == name]
+    return alike if alike and name not in known else [find_case(name, cases)]
+
+
 def load_user_object(place: str, kind: str, fits: Callable[[Any, str], bool]) -> tuple[str, Any]:
     """Return the name and the object at ``FILE.py:NAME``; CzError says why there is none. Bugs of the file are raised.
 

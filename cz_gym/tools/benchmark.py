@@ -13,7 +13,7 @@ from cz_gym.evaluation.protocol import (
     Contender,
     agent,
     check_apart,
-    find_case,
+    find_cases,
     user_case,
     user_controller,
 )
@@ -69,7 +69,9 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         "training seeds of one agent"
     )
     add("--agent", type=_agent_file, action="append", default=[], metavar="[NAME=]FILE", help=agent_help)
-    own = "controller of your own, beside the classical ones of README's table unless --controllers names some"
+    own = (
+        "controller of your own, beside paper, paper-tuned, lqg-at-0.02, lqg-one-design unless --controllers names some"
+    )
     add("--controller", action="append", default=[], metavar="FILE.py:NAME", help=own)
     parser.add_puller("every case runs on it, with the controllers that are designed for it")
     about = "largest deviation of the diameter that is no scrap, in the report for --puller [mm] (1)"
@@ -145,7 +147,8 @@ def cases_of(arguments: argparse.Namespace) -> list[Case]:
         raise CzError(f"--tolerance {arguments.tolerance:g} must be up to 50 mm, beside --puller FILE.toml, of Cz-v0")
     own = arguments.own_scenarios
     usual = [case.name for case in task.cases if case.default] if arguments.scenario is None else arguments.scenario
-    cases = [*(find_case(name, task.cases) for name in usual if name not in own), *map(user_case, own)]
+    named = [case for name in usual if name not in own for case in find_cases(name, task.cases)]
+    cases = [*named, *map(user_case, own)]
     check_apart([case.name for case in cases], "scenario")
     puller = chosen_puller(arguments.puller)
     tolerance = 0.5 * MM * (arguments.tolerance or 1.0) if graded else None

@@ -97,7 +97,7 @@ def find_policy(name: str, config: Config) -> Any:
 def reference_scores(config: Config) -> dict[str, float]:
     """Minari's ``ref_min_score`` and ``ref_max_score``: mean returns of open loop and of the best classical controller.
 
-    The crystals are the first 100 of validation; the controllers are those of README's table.
+    The crystals are the first 100 of validation; the controllers are those that reports quote.
     """
     chosen = [each for each in CONTROLLERS if each.name == "open-loop" or (each.quoted and not each.bound)]
     runs = [rollout(each.make(config), config, VALIDATION_SEEDS[:100]) for each in chosen]

@@ -193,7 +193,10 @@ def controllers() -> Iterator[Section]:
 
 def scenarios() -> Iterator[Section]:
     """Scenarios of crystals, and those that the benchmark alone knows."""
-    told = {each.name: each.meaning for each in CASES}
+    told = dict[str, str]()
+    for case in CASES:
+        for name in (case.scenario, case.name):
+            told.setdefault(name, case.meaning)
     yield (
         "scenarios",
         [(name, told[name]) for name in told if name in SCENARIOS] + [("all", f"in training: {ALL.name}")],

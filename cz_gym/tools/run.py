@@ -34,7 +34,7 @@ from cz_gym.support.files import check_writable, name_file_in_errors, write_file
 
 from .episodes import CODE, CONTRACT, GAPS, KEYS, Benchmark, read_episodes, read_estimates, to_csv, values_of
 from .registry import agent_hash
-from .report.tables import NAMED, ROBUSTNESS, chosen, typical
+from .report.tables import ROBUSTNESS, in_player, typical
 from .report.task_records import TASKS, TaskRecord, contract_hash, task_of
 
 PRINTED = 1e-4
@@ -123,7 +123,7 @@ def typical_tasks(benchmark: Benchmark, cached: Path) -> list[Task]:
     return [
         (replace(each, trained=each.trained[:1], training_seeds=each.training_seeds[:1]), case,
          [benchmark.seeds(case)[number]], cached.absolute())
-        for case, number in numbers if number for each in chosen(benchmark, case, NAMED)
+        for case, number in numbers if number for each in in_player(benchmark, case)
     ]  # fmt: skip
 
 

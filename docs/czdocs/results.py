@@ -184,6 +184,7 @@ TABLES: dict[str, Callable[[], Lines]] = {
     "stock": partial(copied, "stock/table.md"),
     "offline": partial(copied, "offline/lqg-mixed.txt", "offline/operator-paper.txt"),
     "on-pullers": on_pullers,
+    "sensors": partial(copied, "sensors/table.md"),
     "searches-crystal": partial(searches, "compensated", "lqg-along", "ring-pid-reduced"),
     "searches-lqg": partial(searches, "lqg-at", "lqg-quiet", "lqg.", "lqg-one", "lqg-puller", "lqg-sensor"),
     "searches-pid": partial(searches, *PIDS),

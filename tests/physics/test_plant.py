@@ -338,7 +338,7 @@ OURS = {
     "flux by the wall's temperature [W/m²/K]": lambda: flux_by_wall(Parameters()),
     "the same, `melt-layer` [W/m²/K]": lambda: flux_by_wall(LAYER),
     "gradient in the crystal at the interface [K/mm]": lambda: make_puller().Phi_s / SILICON / 1e3,
-    "heater at 57.6 kW [°C]": lambda: make_puller().T_1_0 - 273.15,
+    "heater at 57.6 kW [K]": lambda: make_puller().T_1_0,
     "rise of the heater over the body [K/min]": warming,
     "energy in the body, without melting down [kWh/kg]": energy,
 }

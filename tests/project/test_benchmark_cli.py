@@ -20,7 +20,7 @@ from cz_gym.agents.contract import write_agent
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import SPEED, Metrics, names_of
 from cz_gym.evaluation.parallel import run_tasks
-from cz_gym.evaluation.protocol import CASES, TEST_SEEDS, find_case
+from cz_gym.evaluation.protocol import CASES, TEST_SEEDS, find_case, find_cases
 from cz_gym.physics.young_laplace import YOUNG_LAPLACE
 from cz_gym.spaces import OBSERVATIONS
 from cz_gym.support.errors import CzError
@@ -309,6 +309,8 @@ def test_rows_have_the_settings_that_their_names_say():
     assert find_case("hard").seeds(7) == range(2_000_000, 2_000_007)
     assert len(find_case("reference-b").seeds(500)) == 1
     assert find_case("paper-ramp-II").config().mix == (0.0, 0.0)
+    assert [case.name for case in find_cases("paper-ramp")] == ["paper-ramp-I", "paper-ramp-II"]
+    assert [case.name for case in find_cases("randomized")] == ["randomized"]
     assert find_case("randomized-2s").config("history").control_interval == 2.0
     exact = find_case("randomized-exact")
     assert (exact.config().meniscus, exact.design_config().meniscus) == (YOUNG_LAPLACE, HURLE)

@@ -3,6 +3,7 @@
 import io
 import re
 from dataclasses import replace
+from itertools import combinations
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -11,6 +12,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+from cz_gym.agents import shipped_names
 from cz_gym.baselines import OpenLoop
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
@@ -22,11 +24,11 @@ from cz_gym.evaluation.rollout import rollout
 from cz_gym.evaluation.statistics import Estimate
 from cz_gym.rendering import canvas
 from cz_gym.tools.episodes import ESTIMATES
-from cz_gym.tools.registry import CONTROLLERS
+from cz_gym.tools.registry import CONTROLLERS, CRYSTAL_CONTROLLERS
 from cz_gym.tools.report import tables, task_records, vector
 from cz_gym.tools.report.figures import draw_figures
 from cz_gym.tools.report.markdown import brief, finding, terminal
-from cz_gym.tools.report.tables import FEWEST, NAMED, best_of_each_kind, chosen, looks_of
+from cz_gym.tools.report.tables import FEWEST, NAMED, PIDS, best_of_each_kind, chosen, looks_of
 from cz_gym.tools.report.task_records import body_verdict as verdict
 from cz_gym.tools.report.task_records import crystal_verdict
 from cz_gym.tools.run import typical_tasks
@@ -213,6 +215,13 @@ def test_no_two_controllers_look_alike():
         assert [len({*part}) for part in zip(*shown, strict=True)] == [NAMED] * 3
 
 
+def test_controllers_of_one_colour_differ_in_mark_and_dashes():
+    others = {*(each.name for each in CRYSTAL_CONTROLLERS), *shipped_names(CRYSTAL.name), "ppo-along"}
+    for one, other in combinations([name for name in STYLES if name not in others], 2):
+        look, its = STYLES[one], STYLES[other]
+        assert look.colour != its.colour or (look.mark != its.mark and look.dashes != its.dashes), (one, other)
+
+
 def test_a_controller_looks_the_same_whoever_takes_part():
     both = looks_of(made(NOMINAL, *everyone()))
     few = looks_of(made(NOMINAL, sample("gradient", 1.0, training_seeds=(0,)), sample("open-loop", 9.0)))
@@ -231,20 +240,20 @@ def test_the_finding_tells_those_who_are_told_apart_and_says_how_much_each_moves
         (contender("agent", training_seeds=(0,)), steps(0.2, 0.3)),
     ]  # fmt: skip
     assert finding(made(cases, *who)) == (
-        "**Of the controllers that are not told which scenario they meet, the learned agent `agent` ranks first.** "
-        "The best classical controller of them is `free`. Their mean costs, of radius error and drive moves, are "
-        "0.2010 and 0.4020 on `randomized`, and 0.2010 and 0.4020 on `hard`. Of those that are told, and tuned for "
-        "each scenario, the best are `told` on `randomized` (0.1005) and `told` on `hard` (0.1005). On `randomized`, "
-        "`agent`, `free` and `told` have a radius error of 0.800, 0.600 and 0.900 mm (RMSE). Their pull speed changes "
-        "by 0.3000, 0.2000 and 0.5000 mm/min (RMS) from sample to sample. No learned agent lost a crystal."
+        "**Not told which scenario it meets, the learned agent `agent` ranks first: its mean cost, of radius error and "
+        "drive moves, is 0.2010 on `randomized` and 0.2010 on `hard`**; the best classical controller that is not "
+        "told, `free`, has 0.4020 and 0.4020, and the best of those that are told, and tuned for each scenario, have "
+        "0.1005 (`told`) and 0.1005 (`told`). The radius error alone (RMSE) is least on `randomized` with `free`, "
+        "0.600 mm at pull steps of 0.2000 mm/min; `agent` has 0.800 mm at pull steps of 0.3000 mm/min, and no learned "
+        "agent lost a crystal."
     )
     who[3][1]["failure_rate"] = [0.0] * 19 + [1.0]
-    said = "Learned agents lose at most 5.00 % of the crystals of a scenario (`agent` on `randomized`)."
+    said = "learned agents lose at most 5.00 % of the crystals of a scenario (`agent` on `randomized`)."
     assert finding(made(cases, *who)).endswith(said)
     who[3][1].pop("failure_rate")
     assert finding(made(cases, *who[1:])) == ""
     close = finding(made(cases, *who[:3], (who[3][0], steps(0.399, 0.3))))
-    assert "on `hard` (intervals overlap). Of those that are told" in close
+    assert "on `hard` (intervals overlap)**; the best classical" in close
 
 
 def test_the_plot_shows_all_whom_the_finding_names():
@@ -264,12 +273,12 @@ def test_the_plot_shows_all_whom_the_finding_names():
 
 def test_the_plot_shows_pids_as_such_and_the_share_that_one_loses():
     """They have places beside the others; one far off has its number."""
-    names_of = ["paper", *vector.PIDS, *"abcdefgh"]
+    names_of = ["paper", *PIDS, *"abcdefgh"]
     who = [(contender(name), {"rmse_mm": [0.1] * 4, "failure_rate": [0.0] * 4}) for name in names_of]
-    who[1] = contender(vector.PIDS[0]), {"rmse_mm": [9.0] * 4, "failure_rate": [0.0, 1.0, 1.0, 0.0]}
+    who[1] = contender(PIDS[0]), {"rmse_mm": [9.0] * 4, "failure_rate": [0.0, 1.0, 1.0, 0.0]}
     benchmark = made(find_case("randomized"), *who)
     words = [each.text for each in ElementTree.fromstring(vector.result(benchmark)).iter(f"{SVG}text")]
-    assert {"paper (PID)", *vector.PIDS, "50 % lost, 9 mm →"} <= {*words}
+    assert {"paper (PID)", *(vector.PLAIN.get(name, name) for name in PIDS), "50 % lost, 9 mm →"} <= {*words}
 
 
 def test_the_crystal_that_pictures_show_is_usual_for_every_controller():

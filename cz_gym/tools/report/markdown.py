@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from shutil import get_terminal_size
 from typing import Any
 
@@ -157,9 +157,10 @@ def brief(benchmark: Benchmark) -> str:
 
 
 def finding(benchmark: Benchmark) -> str:
-    """Name the best controllers that are not told the scenario, by kind, the best told ones, and how much each moves.
+    """Say in two sentences who is best by cost, of those that are not told the scenario and of those that are, and who
+    holds the radius closest, with how much they move.
 
-    Empty where one of the three is missing, for a puller or of whole crystals, and for a few crystals.
+    Empty where one of these is missing, for a puller or of whole crystals, and for a few crystals.
     """
     cases = tables.deciding(benchmark)[:2]
     graded = cases[0].tolerance is not None or task_of(cases[0]).by_length
@@ -169,21 +170,22 @@ def finding(benchmark: Benchmark) -> str:
     if len(firsts) < 2 + len(cases):
         return ""
     best, other, *told = firsts
-    cost, error, step = (each._replace(interval=False) for each in (tables.COST, tables.RMSE, tables.PULL_STEP))
-    pairs = [_against(benchmark, case, best, other, cost) for case in cases]
-    aware = [f"`{each.name}` on `{case.name}` ({cost.of(benchmark, case, each.name)})"
-             for case, each in zip(cases, told, strict=True)]  # fmt: skip
-    three = ["{}, {} and {}".format(*each) for each in (
-        [f"`{each.name}`" for each in firsts[:3]],
-        *([column.of(benchmark, cases[0], each.name) for each in firsts[:3]] for column in (error, step)),
-    )]  # fmt: skip
+    shown = (each._replace(interval=False) for each in (tables.COST, tables.RMSE, tables.PULL_STEP))
+    cost, error, step = (partial(column.of, benchmark) for column in shown)
     kinds = ["learned agent" if each.learned else "classical controller" for each in (best, other)]
+    ours = [f"{cost(case, best.name)} on `{case.name}`{_near(benchmark, case, best, other)}" for case in cases]
+    theirs = [cost(case, other.name) for case in cases]
+    aware = [f"{cost(case, each.name)} (`{each.name}`)" for case, each in zip(cases, told, strict=True)]
+    closest = tables.closest(benchmark)
+    radius = [f"{error(cases[0], each.name)} mm at pull steps of {step(cases[0], each.name)} mm/min"
+              for each in (closest, best)]  # fmt: skip
+    too = f"; `{best.name}` has {radius[1]}" if closest != best else ""
     return (
-        f"**Of the controllers that are not told which scenario they meet, the {kinds[0]} `{best.name}` ranks first.** "
-        f"The best {kinds[1]} of them is `{other.name}`. Their mean costs, of radius error and drive moves, are "
-        f"{', and '.join(pairs)}. Of those that are told, and tuned for each scenario, the best are "
-        f"{' and '.join(aware)}. On `{cases[0].name}`, {three[0]} have a radius error of {three[1]} mm (RMSE). Their "
-        f"pull speed changes by {three[2]} mm/min (RMS) from sample to sample. {_lost_by_agents(benchmark)}"
+        f"**Not told which scenario it meets, the {kinds[0]} `{best.name}` ranks first: its mean cost, of radius error "
+        f"and drive moves, is {' and '.join(ours)}**; the best {kinds[1]} that is not told, `{other.name}`, has "
+        f"{' and '.join(theirs)}, and the best of those that are told, and tuned for each scenario, have "
+        f"{' and '.join(aware)}. The radius error alone (RMSE) is least on `{cases[0].name}` with `{closest.name}`, "
+        f"{radius[0]}{too}, and {_lost_by_agents(benchmark)}"
     )
 
 
@@ -194,17 +196,16 @@ def _lost_by_agents(benchmark: Benchmark) -> str:
             for case in tables.deciding(benchmark) for each in agents if not each.bound}  # fmt: skip
     case, name = max(lost, key=lambda key: lost[key])
     if not lost[case, name]:
-        return "No learned agent lost a crystal."
+        return "no learned agent lost a crystal."
     most = share.of(benchmark, case, name)
-    return f"Learned agents lose at most {most} % of the crystals of a scenario (`{name}` on `{case.name}`)."
+    return f"learned agents lose at most {most} % of the crystals of a scenario (`{name}` on `{case.name}`)."
 
 
-def _against(benchmark: Benchmark, case: Case, best: Contender, other: Contender, cost: tables.Column) -> str:
-    """Compare mean costs on a scenario, and say where their intervals overlap."""
+def _near(benchmark: Benchmark, case: Case, best: Contender, other: Contender) -> str:
+    """Say where the intervals of two mean costs overlap."""
     get: Any = benchmark.get
-    ours, theirs = (get(case, each.name, cost.metric) for each in (best, other))
-    near = "" if ours.ends[1] < theirs.ends[0] else " (intervals overlap)"
-    return f"{cost.text(ours)} and {cost.text(theirs)} on `{case.name}`{near}"
+    ours, theirs = (get(case, each.name, tables.COST.metric) for each in (best, other))
+    return "" if ours.ends[1] < theirs.ends[0] else " (intervals overlap)"
 
 
 def fill_in(page: str, benchmark: Benchmark) -> str:

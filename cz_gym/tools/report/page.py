@@ -25,7 +25,7 @@ from cz_gym.tools.report.task_records import task_of
 from . import markdown, tables, vector
 from .figures import lost
 from .markdown import measured_from
-from .tables import NAMED, RMSE, chosen, typical
+from .tables import RMSE, in_player, typical
 
 POINT, POINTS = 45.0, 400
 """Time over which a point of a line is the mean at least [s], and most points of a line."""
@@ -38,7 +38,7 @@ COLOURS = {"true": TRUE, "camera": RING, "recipe": INK, "drive": DRIVE}
 
 
 def crystals(benchmark: Benchmark) -> list[dict[str, Any]]:
-    """Return the :func:`.typical` crystal of each scenario under the controllers of :func:`.chosen`, for the player.
+    """Return the :func:`.typical` crystal of each scenario of those of :func:`.in_player`.
 
     Each panel's lines are means over some seconds, up to the first value that is no number, in the panel's unit.
     """
@@ -48,7 +48,7 @@ def crystals(benchmark: Benchmark) -> list[dict[str, Any]]:
 def _crystal(benchmark: Benchmark, case: Case) -> dict[str, Any]:
     task, number = task_of(case), typical(benchmark, case)
     seed = benchmark.seeds(case)[number]
-    names = [each.name for each in chosen(benchmark, case, NAMED)]
+    names = [each.name for each in in_player(benchmark, case)]
     signals = {name: benchmark.signals[case.name, name] for name in names}
     longest = max(len(each.r_c) for each in signals.values())
     step = max(round(POINT / case.control_interval), -(-longest // POINTS), 1)

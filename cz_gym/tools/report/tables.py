@@ -18,6 +18,8 @@ ERRORS = 1e-6, 1e3
 """Range of the errors that :func:`typical` compares [mm]."""
 NAMED = 8
 """Most controllers with a look of their own in a figure."""
+PIDS = "pid-uncompensated", "pid-conventional", "paper-filtered"
+"""Controllers that the result shows beside the best: what a reader knows as a PID, and the paper's where noise is."""
 FEWEST = 20
 """Least number of crystals for a verdict on a scenario with randomness."""
 Table = tuple[tuple[str, ...], list[tuple[str, ...]]]
@@ -169,10 +171,22 @@ def firsts(benchmark: "Benchmark") -> list[Contender]:
     return [*found, *(min(told, key=lambda each: benchmark.rank([case], each.name)) for case in cases if told)]
 
 
+def closest(benchmark: "Benchmark") -> Contender:
+    """Return who has the least radius error on the first deciding scenario; bounds left out where others took part."""
+    case, able = deciding(benchmark)[0], [each for each in benchmark.contenders if not each.bound]
+    return min(able or benchmark.contenders, key=lambda each: benchmark.mean(case, each.name, RMSE.metric))
+
+
 def in_one_look(benchmark: "Benchmark", more: Sequence[str] = ()) -> list[Contender]:
-    """Return, in their order, those of :func:`chosen`, of :func:`firsts`, which the finding names, and ``more``."""
-    names = [each.name for each in (*chosen(benchmark, deciding(benchmark)[0], NAMED), *firsts(benchmark))]
+    """Return, in their order, those of :func:`chosen`, those whom the finding names, and ``more``."""
+    named = *firsts(benchmark), closest(benchmark)
+    names = [each.name for each in (*chosen(benchmark, deciding(benchmark)[0], NAMED), *named)]
     return [each for each in benchmark.contenders if each.name in (*names, *more)]
+
+
+def in_player(benchmark: "Benchmark", case: Case) -> list[Contender]:
+    """Return, in their order, those whose :func:`typical` crystal the player shows."""
+    return in_one_look(benchmark, [*PIDS, *(each.name for each in chosen(benchmark, case, NAMED))])
 
 
 def typical(benchmark: "Benchmark", case: Case) -> int:

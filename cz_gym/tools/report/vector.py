@@ -14,7 +14,7 @@ from cz_gym.evaluation.statistics import Estimate
 from cz_gym.puller.file import DEFAULT
 from cz_gym.tools.episodes import Benchmark
 
-from .tables import FAILURES, PULL_STEP, RMSE, deciding, in_one_look, looks_of
+from .tables import FAILURES, PIDS, PULL_STEP, RMSE, deciding, in_one_look, looks_of
 
 WIDTH = 640.0
 """Width of a picture [px]: its words can be read on a phone too, where it is drawn at about half of that."""
@@ -22,10 +22,10 @@ FAR = 30.0
 """Values beyond this multiple of the least one stand at an axis's end, with their number [-]."""
 LONGEST = 20
 """Longest name that there is room for [characters]."""
-PLAIN = {"randomized": "randomized (usual)", "paper": "paper (PID)", "paper-tuned": "paper-tuned (PID)"}
+PLAIN = {"randomized": "randomized (usual)"} | {
+    f"paper{end}": f"paper{end} (PID)" for end in ("", "-tuned", "-filtered")
+}
 """Scenarios and controllers whose names do not say what they are."""
-PIDS = "pid-uncompensated", "pid-conventional"
-"""Controllers that the result shows beside the best: what a reader knows as a PID."""
 OFTEN = 0.05
 """Share of crystals lost above which a row of the result says it [-]."""
 STYLE = "\n".join(
@@ -206,7 +206,7 @@ def _key(y: float, told: str, learned: bool) -> list[str]:
     """Say what the kinds of marks mean that there are."""
     ink = Style(COLOURS[-1], "circle", ())
     keys = [(ink, False, "other marks: classical" if learned else "classical")]
-    keys += [(ink._replace(mark="diamond"), False, "diamonds: learned")] if learned else []
+    keys += [(ink._replace(mark="diamond"), False, "diamonds, kites: learned")] if learned else []
     keys += [(ink, True, told)] if told else []
     parts = []
     for number, (look, hollow, words) in enumerate(keys):  # what is hollow has a line of its own
