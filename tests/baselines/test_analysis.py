@@ -235,7 +235,7 @@ def test_a_loop_that_nothing_moves_has_every_margin():
 
 
 @pytest.mark.parametrize(("name", "config"), CASES)
-@pytest.mark.parametrize("lam", [1.0, 0.0])
+@pytest.mark.parametrize("lam", [pytest.param(1.0, marks=pytest.mark.slow), 0.0])
 def test_margins_are_python_controls(name, config, lam):
     form, lags = form_of(name, config), lags_of(config)
     omega, gains = gains_of(form, make_puller(lam=lam), lags, 4000)

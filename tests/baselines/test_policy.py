@@ -239,7 +239,7 @@ def read_with(name, errors):
 
 
 @pytest.mark.parametrize("errors", ERRING)
-@pytest.mark.parametrize("name", ["lqg", "lqg-at-0.02", "paper-tuned"])
+@pytest.mark.parametrize("name", [pytest.param("lqg", marks=pytest.mark.slow), "lqg-at-0.02", "paper-tuned"])
 def test_erring_readings_of_the_drives_lose_no_crystal(name, errors):
     """A power that read half a percent wrong lost every crystal of the LQGs when moves began at readings."""
     usual, found = read_with(name, "none"), read_with(name, errors)

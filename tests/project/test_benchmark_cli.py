@@ -354,7 +354,7 @@ def test_one_s_own_controller_runs_beside_a_few_into_its_own_folder(tmp_path, mo
     "method",
     [
         pytest.param("spawn", marks=pytest.mark.slow),
-        pytest.param("fork", marks=pytest.mark.skipif("sys.platform == 'win32'")),
+        pytest.param("fork", marks=[pytest.mark.slow, pytest.mark.skipif("sys.platform == 'win32'")]),
     ],
 )
 def test_everything_of_a_benchmark_passes_to_other_processes_as_a_value(method, tmp_path, monkeypatch):

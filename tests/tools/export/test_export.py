@@ -232,7 +232,11 @@ def test_the_test_vector_is_what_every_language_computes(name, runner):
 
 @pytest.mark.parametrize(
     ("name", "identifier"),
-    [("a*/ int x; /*", "a_int_x"), ("(*) evil__name_", "evil_name"), ("Zähler-Größe", "zahler_groe"), ("µ", "agent")],
+    [
+        ("a*/ int x; /*", "a_int_x"),
+        ("(*) evil__name_", "evil_name"),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("Zähler-Größe", "zahler_groe"), ("µ", "agent"))),
+    ],
 )
 def test_a_name_becomes_no_code(name, identifier):
     """CasADi 1188 and 1359, rosidl 994, 4diac-forte 17, openplc-editor PR 937."""
