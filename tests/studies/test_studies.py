@@ -343,7 +343,7 @@ def test_the_committed_results_fill_pages_and_pictures_again(tmp_path, monkeypat
     results.write_bytes((ROOT / "results" / "benchmark" / "benchmark.json").read_bytes())
     monkeypatch.setattr(picture, "PAGES", [page])
     assert picture.main([str(results)]) == 0
-    (said,) = re.findall(r"begin -->\n(\*\*Of the controllers .*)\n<!-- finding:end", page.read_text())
+    (said,) = re.findall(r"begin -->\n(\*\*Not told .*)\n<!-- finding:end", page.read_text())
     assert said in README.read_text()
     for name in ("result.svg", "pareto.svg"):
         assert (tmp_path / name).read_bytes() == (ROOT / "results" / "benchmark" / name).read_bytes()

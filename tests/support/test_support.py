@@ -268,7 +268,7 @@ def test_lists_name_everything_that_commands_take_in_80_columns(words, capsys):
     if len(words) == 1:
         everyone = [each.name for controllers in KNOWN.values() for each in controllers]
         known = [*everyone, *(each.name for each in CASES), *SCENARIOS, "all", "silicon-300mm", *known]
-    assert {*known} - {"paper-ramp"} == {*names} - {"default", "germanium"}
+    assert {*known} == {*names} - {"default", "germanium"}
 
 
 def test_a_reader_that_has_seen_enough_ends_the_command_quietly():
