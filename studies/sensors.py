@@ -12,12 +12,14 @@ from itertools import combinations
 
 import numpy as np
 
+from cz_gym.baselines.crystal import CrystalLQG
 from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.evaluation.metrics import crystal_metrics
 from cz_gym.evaluation.protocol import TRAINING_SEEDS
 from cz_gym.evaluation.rollout import rollout
 from cz_gym.support.command_line import between
+from cz_gym.support.errors import require_type
 from cz_gym.support.files import write_files
 from cz_gym.tools.registry import make_controller
 from cz_gym.tools.report.tables import markdown
@@ -31,7 +33,8 @@ CHOICES = [choice for count in range(1, len(SENSORS) + 1) for choice in combinat
 def row_of(sensors: Sequence[str], crystals: int) -> tuple[str, ...]:
     """Sensors, lost crowns [%], and median and 95 % quantile of each crown's largest error [mm]; lost ones are 12."""
     config = make_config("randomized", observation="measured", action="direct", process=CRYSTAL, stage="crown")
-    controller = replace(make_controller(CONTROLLER, config), sensors=("pyrometer", *sensors))
+    whole = require_type(CrystalLQG, make_controller(CONTROLLER, config), "a controller with a choice of sensors")
+    controller = replace(whole, sensors=("pyrometer", *sensors))
     found = crystal_metrics(rollout(controller, config, TRAINING_SEEDS[:crystals]))
     middle, most = np.quantile(found.crown_max_mm, (0.5, 0.95))
     lost = f"{100.0 * (1.0 - found.completed.mean()):.0f}"

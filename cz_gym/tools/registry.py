@@ -195,7 +195,7 @@ def scenarios() -> Iterator[Section]:
     """Scenarios of crystals, and those that the benchmark alone knows."""
     told = dict[str, str]()
     for case in CASES:
-        for name in (case.scenario, case.name):
+        for name in (str(case.scenario), case.name):
             told.setdefault(name, case.meaning)
     yield (
         "scenarios",

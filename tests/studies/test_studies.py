@@ -24,7 +24,7 @@ from cz_gym.tools import leaderboard
 from cz_gym.tools.registry import agent_hash
 from cz_gym.tools.report.task_records import contract_hash
 from cz_gym.tools.run import earlier_robustness
-from studies import cards, faults, frontier, picture, ranks, robustness, speed, stock
+from studies import cards, faults, frontier, picture, ranks, robustness, sensors, speed, stock
 from tests.conftest import ROOT
 
 FIGURES = {key: {"mean": 0.0, "ci95": [0.0, 0.5]} for key in (*(of.metric for of in cards.FIGURES), cards.RETURN)}
@@ -312,6 +312,27 @@ def test_the_limit_falls_with_the_zero_and_grows_with_the_noise():
 
 
 @pytest.mark.slow
+def test_places_go_by_crystals_lost_then_by_cost():
+    found = [(0, 2.0), (1, 0.5), (0, 1.0)]
+    metrics = {
+        str(k): SimpleNamespace(failure_rate=np.array([n]), cost=np.array([c])) for k, (n, c) in enumerate(found)
+    }
+    assert ranks.places(metrics) == [1, 2, 0]
+
+
+def test_who_moves_less_has_a_larger_least_error_and_moving_more_gains_nothing_in_the_end():
+    puller = make_puller(lam=ranks.MIX)
+    least = [ranks.limit(puller, ranks.CAMERA, activity=step / 60000.0) for step in (0.01, 0.02, 5.0, 50.0)]
+    assert least[0] > least[1] > least[2] == least[3]
+
+
+@pytest.mark.slow
+def test_sensors_alone_and_together_are_rows_of_a_table(tmp_path):
+    assert sensors.main(["--crystals", "1", "--out", str(tmp_path)]) == 0
+    rows = [line for line in (tmp_path / "table.md").read_text().splitlines() if line.startswith("| ")][1:]
+    assert [row.split(" | ")[0].strip("| ") for row in rows] == [", ".join(choice) for choice in sensors.CHOICES]
+
+
 def test_ranks_write_their_table_and_figure(tmp_path):
     assert ranks.main(["paper-filtered", "pid-conventional", "--crystals", "2", "--out", str(tmp_path)]) == 0
     table = (tmp_path / "table.md").read_text()
