@@ -69,9 +69,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         "training seeds of one agent"
     )
     add("--agent", type=_agent_file, action="append", default=[], metavar="[NAME=]FILE", help=agent_help)
-    own = (
-        "controller of your own, beside paper, paper-tuned, lqg-at-0.02, lqg-one-design unless --controllers names some"
-    )
+    beside = ", ".join(each.name for each in TASKS["Cz-v0"].controllers() if each.quoted)
+    own = f"controller of your own, beside {beside} unless --controllers names some"
     add("--controller", action="append", default=[], metavar="FILE.py:NAME", help=own)
     parser.add_puller("every case runs on it, with the controllers that are designed for it")
     about = "largest deviation of the diameter that is no scrap, in the report for --puller [mm] (1)"

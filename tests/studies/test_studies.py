@@ -311,7 +311,6 @@ def test_the_limit_falls_with_the_zero_and_grows_with_the_noise():
     assert by_noise == sorted(by_noise)
 
 
-@pytest.mark.slow
 def test_places_go_by_crystals_lost_then_by_cost():
     found = [(0, 2.0), (1, 0.5), (0, 1.0)]
     metrics = {
@@ -333,6 +332,7 @@ def test_sensors_alone_and_together_are_rows_of_a_table(tmp_path):
     assert [row.split(" | ")[0].strip("| ") for row in rows] == [", ".join(choice) for choice in sensors.CHOICES]
 
 
+@pytest.mark.slow
 def test_ranks_write_their_table_and_figure(tmp_path):
     assert ranks.main(["paper-filtered", "pid-conventional", "--crystals", "2", "--out", str(tmp_path)]) == 0
     table = (tmp_path / "table.md").read_text()

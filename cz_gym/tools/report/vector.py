@@ -22,9 +22,10 @@ FAR = 30.0
 """Values beyond this multiple of the least one stand at an axis's end, with their number [-]."""
 LONGEST = 20
 """Longest name that there is room for [characters]."""
-PLAIN = {"randomized": "randomized (usual)"} | {
-    f"paper{end}": f"paper{end} (PID)" for end in ("", "-tuned", "-filtered")
-}
+PLAIN = {
+    "randomized": "randomized (usual)", "paper": "paper (PID)", "paper-tuned": "paper-tuned (PID)",
+    "paper-filtered": "paper-filtered (PID)",
+}  # fmt: skip
 """Scenarios and controllers whose names do not say what they are."""
 OFTEN = 0.05
 """Share of crystals lost above which a row of the result says it [-]."""
