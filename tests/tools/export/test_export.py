@@ -732,9 +732,9 @@ def test_what_cannot_be_exported_is_refused_in_one_line(given, said, tmp_path, r
     """The folder has a block of ``paper``, whose test vector would be checked against another block. A name that does
     not exist is refused before the fallback is searched, which takes seconds.
     """
+    (tmp_path / "README.md").write_text(readme(block_of("paper"), [], False))
     if "unknown" in said:
         monkeypatch.setattr(controllers, "fallback", lambda _: pytest.fail("searched"))
-    (tmp_path / "README.md").write_text(readme(block_of("paper"), [], False))
     assert said in refused(main, [*given.split(), "--out", str(tmp_path)])
     assert [file.name for file in tmp_path.iterdir()] == ["README.md"]
 
