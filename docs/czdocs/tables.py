@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from cz_gym import SCENARIOS, Scenario
+from cz_gym.baselines.margins import PLACES, worst_margins
 from cz_gym.body.signals import INFO_ROWS
 from cz_gym.camera.view import Camera
+from cz_gym.config import make_config
 from cz_gym.crystal.process import CRYSTAL
 from cz_gym.episodes.scenario import FAMILIES
 from cz_gym.episodes.scenarios import ALL, RANDOMIZED
@@ -23,12 +25,14 @@ from cz_gym.process import PULL_SCALE, Channel
 from cz_gym.puller.file import DEFAULT, value_of
 from cz_gym.spaces import HISTORY, LAGGED, LAGS, MEASURED, STATE
 from cz_gym.support.units import MINUTE
+from cz_gym.tools.registry import make_controller
 from cz_gym.tools.serve.machine import OWN_TAGS, TAGS, Tag
 
 from . import nomenclature, results
 
 ABSENT = "\N{EN DASH}"
 POWERS = str.maketrans("234", "²³⁴")
+LOOPS = ("paper", "paper-tuned", "lqg-quiet", "lqg", "lqg-at-0.02", "lqg-one-design", "lqg-robust")
 
 
 def markdown(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
@@ -163,6 +167,20 @@ def exported() -> list[str]:
     return markdown(("controller", "C", "largest difference of an action", "rows of the table that differ"), rows)
 
 
+def margins() -> list[str]:
+    """Margins of controllers' loops at each opening, on ``randomized``."""
+    config = make_config(RANDOMIZED, None, "measured", action="direct")
+    loops = [worst_margins(make_controller(name, config), config) for name in LOOPS]
+    gains, times = ("gain may grow by", "gain may fall to"), ("phase margin [degrees]", "may be late by [s]")
+    words = *gains, *times, "peak of the sensitivity"
+    rows = []
+    for place, of in zip(PLACES, zip(*loops, strict=True), strict=True):
+        for what, values in zip(words, zip(*of, strict=True), strict=True):
+            shown = (f"{value:.0f}" if value >= 10.0 else f"{value:.2g}" if value else ABSENT for value in values)
+            rows.append((f"{place}: {what}", *shown))
+    return results.table(("", *map(code, LOOPS)), rows)
+
+
 def tags(listed: tuple[Tag, ...]) -> list[str]:
     """Tags of the virtual puller."""
     return markdown(("tag", "type", "meaning"), ((code(t.name), t.kind.__name__, t.meaning) for t in listed))
@@ -180,6 +198,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "families": families,
     "camera": camera,
     "exported": exported,
+    "margins": margins,
     "tags": partial(tags, TAGS),
     "crystal-tags": partial(tags, OWN_TAGS),
     "puller": puller,

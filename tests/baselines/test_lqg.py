@@ -322,7 +322,7 @@ def test_the_adaptive_lqg_holds_the_slowest_hot_zones():
     config = make_config("hot-zone", **PLAIN)
     plain, seeds = make_controller("lqg-at-0.02", config), (1_000_102, 1_000_275)
     assert not rollout(adaptive(plain).for_config(config), config, seeds).failed.any()
-    noise = replace(plain.design.noise, slow_sd=2.0 * plain.design.noise.slow_sd)
+    noise = replace(plain.design.noise, slow_sd=1.4 * plain.design.noise.slow_sd)
     form = linear_form(replace(plain, design=replace(plain.design, noise=noise)))
     assert not any(close(form.controller, puller, form.dt).stable for puller in pullers_of(config, seeds))
 

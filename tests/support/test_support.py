@@ -272,11 +272,11 @@ def test_lists_name_everything_that_commands_take_in_80_columns(words, capsys):
 
 
 def test_a_reader_that_has_seen_enough_ends_the_command_quietly():
-    """As of ``cz-gym puller default | head -1``."""
-    code = "import cz_gym_command, sys; sys.exit(cz_gym_command.main(['puller', 'default']))"
+    """As of ``cz-gym list | head -1``."""
+    code = "import cz_gym_command, sys; sys.exit(cz_gym_command.main(['list']))"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         process.stdout.close()
-        assert process.stderr.read() in (b"", b"cz-gym puller: loading its packages\n")
+        assert process.stderr.read() in (b"", b"cz-gym list: loading its packages\n")
     assert process.returncode == 141
 
 
@@ -337,7 +337,7 @@ FULL = pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has
 
 
 @FULL
-@pytest.mark.parametrize("words", [["--help"], ["puller", "default"]])
+@pytest.mark.parametrize("words", [["--help"], ["list"]])
 def test_a_full_disk_is_told_in_one_line(words):
     with open("/dev/full", "w") as full:
         command = [sys.executable, "-m", "cz_gym", *words]
@@ -348,6 +348,7 @@ def test_a_full_disk_is_told_in_one_line(words):
     assert said[0].endswith("the output cannot be written: No space left on device")
 
 
+@pytest.mark.slow
 def test_a_terminal_of_ascii_shows_question_marks():
     """As of a cron job."""
     env = {name: value for name, value in os.environ.items() if not name.startswith(("LC_", "LANG", "PYTHON"))}

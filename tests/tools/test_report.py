@@ -65,6 +65,7 @@ def made():
     return Made()
 
 
+@pytest.mark.slow
 def test_the_tables_are_the_results(made):
     """Every metric has a column with a unit; who loses the fewest crystals, then has the lowest cost, stands first."""
     rows = iter(made.rows)
