@@ -235,6 +235,7 @@ def test_scalar_environments_learn_too():
     assert APG("RecurrentPolicy", env, window=10).learn(40).num_timesteps == 40
 
 
+@pytest.mark.slow
 def test_apg_lowers_the_cost_in_a_few_updates():
     """On the same crystals before and after: from losing them to following the reference for an hour."""
     model, batch = algorithm(24, 90), DifferentiableBatch(CONFIG, 24)

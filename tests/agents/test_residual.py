@@ -47,7 +47,7 @@ def agent():
     return bold(SMALL)[0]
 
 
-@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("told", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_at_limits_of_zero_it_is_the_controller_bit_for_bit(told):
     agent, _ = bold(replace(SMALL, limits=(0.0, 0.0), told=told))
     config = SMALL.config

@@ -122,8 +122,9 @@ def content(path):
     return json.loads(path.read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-@pytest.mark.parametrize("algorithm", [pytest.param("gradient", marks=pytest.mark.slow), "ppo"])
+@pytest.mark.parametrize("algorithm", ["gradient", "ppo"])
 def test_a_run_leaves_everything_and_goes_on(algorithm, tmp_path, capsys):
     folder = tmp_path / "run"
     assert train.main(["--algo", algorithm, "--steps", "9000", "--seed", "3", "--out", str(folder), "--plot"]) == 0
@@ -449,9 +450,8 @@ def test_crystals_that_judge_neither_select_nor_test():
     assert not judged & (set(recipes.SELECTION_SEEDS) | set(TEST_SEEDS))
 
 
-@pytest.mark.parametrize(
-    "scenario", ["randomized", pytest.param("randomized=0.4,hard=0.2,puller=0.4", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("scenario", ["randomized", "randomized=0.4,hard=0.2,puller=0.4"])
+@pytest.mark.slow
 def test_a_reference_has_its_design_for_each_crystal(scenario, monkeypatch):
     monkeypatch.setattr(recipes, "SELECTION_SEEDS", SEEDS)
     monkeypatch.setattr(recipes, "JUDGING_SEEDS", SEEDS[:1])

@@ -33,6 +33,7 @@ def test_goldens_notice_a_change_of_any_parameter(name):
     assert not np.allclose(rows, GOLDEN["randomized, I"], rtol=1e-9, atol=0.0)
 
 
+@pytest.mark.slow
 def test_the_same_bits_in_another_process():
     """And from an installed wheel: ``tests/project/test_packaging.py``."""
     assert python("-m", "tests.golden.digest").split() == [digest(), str(ROOT / "cz_gym" / "__init__.py")]

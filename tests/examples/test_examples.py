@@ -83,6 +83,7 @@ def test_an_example_without_its_packages_says_in_one_line_what_to_install():
     assert re.fullmatch(r"\w+ is missing: .*pip install .*\n", done.stderr)
 
 
+@pytest.mark.slow
 def test_the_predictive_controller_holds_a_crystal_as_lqg_does():
     config = make_config(horizon=600.0, **PLAIN)
     own, lqg = (
@@ -150,7 +151,9 @@ def test_every_file_says_its_command():
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
-@pytest.mark.parametrize("manner", anywhere.LOOPS)
+@pytest.mark.parametrize(
+    "manner", [pytest.param(each, marks=[pytest.mark.slow] * (each == "torchrl")) for each in anywhere.LOOPS]
+)
 def test_a_loop_in_the_manner_of_each_library_ends_in_an_agent_file(manner, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(recipes, "JUDGING_SEEDS", recipes.JUDGING_SEEDS[:2])
     file = tmp_path / "agent.onnx"

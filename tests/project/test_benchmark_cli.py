@@ -105,6 +105,7 @@ def crystals(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_stages_of_whole_crystals_have_the_same_report_with_metrics_of_their_own(crystals):
     assert sorted(path.name for path in crystals.iterdir()) == FILES
     data, report = json.loads((crystals / "benchmark.json").read_text()), (crystals / "report.md").read_text()

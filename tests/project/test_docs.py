@@ -30,7 +30,10 @@ from tests.conftest import ROOT, python
 DOCS = ROOT / "docs"
 NOTEBOOKS = runpy.run_path(str(DOCS / "notebooks.py"))
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "results" / "README.md", *sorted(DOCS.rglob("*.md"))]
-SLOW = {"docs/paper.md", "docs/extend/meniscus.md", "docs/your-puller.md", "docs/learn/libraries.md"}
+SLOW = {
+    "docs/paper.md", "docs/extend/meniscus.md", "docs/your-puller.md", "docs/learn/libraries.md", "docs/crystal.md",
+    "docs/crystal-agent.md", "docs/camera.md",
+}  # fmt: skip
 SMALL = {
     "num_envs=10_000": "num_envs=100",
     "make_vec_env(1024": "make_vec_env(32",

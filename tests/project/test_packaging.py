@@ -71,6 +71,7 @@ def printed(code, place, cwd):
     return python("-W", "error", "-c", prelude + code, cwd=cwd).split()
 
 
+@pytest.mark.slow
 def test_a_clone_finds_its_packages_without_an_installation():
     """As after ``pip install .``, whose package the clone's own folder hides."""
     code = "import cz_gym.baselines, cz_gym.agents; print(cz_gym.baselines.__file__)"

@@ -220,6 +220,7 @@ def test_gymnasiums_wrappers_for_windows_and_lists_of_frames_work():
     assert len(listed.render()) == 2
 
 
+@pytest.mark.slow
 def test_without_pygame_nothing_is_declared_and_asking_says_what_to_install():
     code = (
         "import sys\nsys.modules['pygame'] = None\n"

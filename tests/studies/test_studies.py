@@ -174,6 +174,7 @@ def one_call(monkeypatch):
 
 
 @pytest.mark.usefixtures("one_call")
+@pytest.mark.slow
 def test_the_speed_command_writes_json_and_prints_a_table(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(speed, "cases", lambda: {**QUICK, "peer": partial(__import__, "no_such_package")})
     file = tmp_path / "new" / "speed.json"
@@ -283,6 +284,7 @@ def test_a_fault_made_anew_leaves_the_other_rows_of_the_report(monkeypatch, tmp_
 # Ranks under moved estimates, and the limit
 
 
+@pytest.mark.slow
 def test_the_limit_is_what_a_simulated_linear_loop_has():
     """Error and pull step of the filter and the regulator on the linear plant, from 4,000 runs of independent noise."""
     puller, price, rng = make_puller(lam=0.5), 1.0, np.random.default_rng(5)

@@ -317,6 +317,7 @@ def test_only_what_is_meant_for_the_user_is_one_line_and_a_bug_keeps_its_traceba
     assert capsys.readouterr().err == said
 
 
+@pytest.mark.slow
 def test_commands_draw_although_a_notebook_names_a_backend_that_is_missing():
     code = "from cz_gym.support.command_line import run_command\ndef body():\n import matplotlib.figure\n return 7"
     named = {**os.environ, "MPLBACKEND": "module://matplotlib_inline.backend_inline"}

@@ -198,7 +198,7 @@ def test_a_block_is_its_controller_in_every_language(name, scenario):
 
 
 @needs_compiler
-@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize("single", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize("name", ["paper-tuned", pytest.param("lqg", marks=pytest.mark.slow)])
 def test_the_c_compiles_under_strict_options_with_little_stack_and_its_header_in_cpp(name, single, tmp_path):
     block = block_of(name)

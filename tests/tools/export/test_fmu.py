@@ -110,6 +110,7 @@ def test_a_unit_ends_before_its_python(unit, monkeypatch):
         assert ended.count("finalizePythonInterpreter") == count
 
 
+@pytest.mark.slow
 def test_units_of_one_process_are_each_its_own(tmp_path):
     """PythonFMU #97: Python keeps one module of a name, so the second unit was silently the first."""
     own = {

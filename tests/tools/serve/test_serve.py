@@ -223,6 +223,7 @@ def test_a_name_that_is_not_this_server_reads_nothing(puller, host, status):
     assert asked(f"http://127.0.0.1:{puller.page}/data", headers={"Host": host})[0] == status
 
 
+@pytest.mark.slow
 def test_ipv6_has_brackets_in_addresses(tmp_path, capsys):
     """opcua-asyncio #1129."""
     with running(tmp_path, "--host", "::1", "--speed", "20") as puller:
@@ -371,6 +372,7 @@ def test_a_certificate_that_no_client_could_trust_is_refused(tmp_path, given, sa
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_port_0_is_a_free_one_that_is_named(tmp_path, capsys):
     with running(tmp_path, "--port", "0"):
         url = re.search(r"OPC UA: (\S+)", capsys.readouterr().out)[1]
@@ -387,7 +389,8 @@ needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="cc is no
     ("name", "scenario", "options", "steps"),
     [
         pytest.param("paper", "randomized", (), 200, marks=pytest.mark.slow),
-        ("ppo", "puller", (), 100),
+        pytest.param("ppo", "puller", (), 100, marks=pytest.mark.slow),
+        ("paper", "puller", (), 40),
         pytest.param("gradient", "puller", ("--compiled",), 200, marks=(needs_compiler, pytest.mark.slow)),
         pytest.param("paper", "randomized", (), 2160, marks=pytest.mark.slow),
     ],
