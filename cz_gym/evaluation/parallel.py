@@ -6,7 +6,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import import_module
 from multiprocessing import get_context
@@ -166,8 +166,20 @@ def on_cluster(
 @contextmanager
 def _client(distributed: Any, address: str) -> Iterator[Any]:
     """Connect to the scheduler; CzError if none answers, or no worker comes."""
+
+    class Client(distributed.Client):  # type: ignore[misc]
+        """Closes where it does not connect: as garbage it would wait for a lock that the next client's start holds."""
+
+        def start(self, **settings: Any) -> None:
+            try:
+                super().start(**settings)
+            except BaseException:
+                with suppress(Exception):
+                    self.close()
+                raise
+
     try:
-        client = distributed.Client(address, timeout=ANSWER, set_as_default=False)
+        client = Client(address, timeout=ANSWER, set_as_default=False)
     except (OSError, ValueError, AssertionError) as error:  # asserted: the loop's thread runs within ten seconds
         why = str(error) or "this computer is too busy to ask"
         raise CzError(f"no Dask scheduler answers at {address!r}, an address such as tcp://HOST:8786: {why}") from None

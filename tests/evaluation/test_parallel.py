@@ -181,3 +181,19 @@ def test_an_address_without_a_scheduler_is_one_line(address, monkeypatch):
     monkeypatch.setattr(parallel, "ANSWER", 0.5)
     with pytest.raises(CzError, match=f"no Dask scheduler answers at '{address}'"):
         list(parallel.on_cluster(address, abs, [1]))
+
+
+@pytest.mark.usefixtures("dask")
+def test_a_client_that_does_not_connect_is_closed_and_takes_no_lock_as_garbage(monkeypatch):
+    """A collection may begin in the thread that starts the next client, and holds the lock of all loops."""
+    from distributed import Client
+    from distributed.utils import LoopRunner
+
+    monkeypatch.setattr(parallel, "ANSWER", 0.5)
+    made, new = [], Client.__new__
+    monkeypatch.setattr(Client, "__new__", lambda kind, *given, **named: made.append(new(kind)) or made[0])
+    with pytest.raises(CzError):
+        list(parallel.on_cluster("nowhere", abs, [1]))
+    assert made[0].status == "closed"
+    with LoopRunner._lock:
+        made.pop().__del__()
