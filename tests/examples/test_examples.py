@@ -33,7 +33,7 @@ SEEDS = range(1_000_000, 1_000_002)
 MPC = "examples/mpc.py:mpc"
 
 
-@pytest.mark.slow  # the page docs/first-agent.md has the same lines
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_crystals")
 def test_the_stable_baselines_example_writes_an_agent(tmp_path):
     contract = sb3_ppo.main(steps=40_000, out=tmp_path / "some.onnx")

@@ -120,6 +120,7 @@ def test_stages_of_whole_crystals_have_the_same_report_with_metrics_of_their_own
     assert "| controller | lost of crown / tail-puller [%] | 95 % of crowns [mm] | body within 0.5 mm [%] |" in report
 
 
+@pytest.mark.slow
 def test_whole_crystals_are_quoted_in_two_pages(crystals, tmp_path, monkeypatch):
     pages = [tmp_path / "README.md", tmp_path / "crystal.md"]
     for page in pages:
@@ -336,6 +337,7 @@ later = replace(REFERENCE_B, name="later")
 """
 
 
+@pytest.mark.slow
 def test_one_s_own_controller_runs_beside_a_few_into_its_own_folder(tmp_path, monkeypatch, capsys, refusal):
     monkeypatch.chdir(tmp_path)
     Path("mine.py").write_text(MINE)

@@ -32,7 +32,7 @@ NOTEBOOKS = runpy.run_path(str(DOCS / "notebooks.py"))
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "results" / "README.md", *sorted(DOCS.rglob("*.md"))]
 SLOW = {
     "docs/paper.md", "docs/extend/meniscus.md", "docs/your-puller.md", "docs/learn/libraries.md", "docs/crystal.md",
-    "docs/crystal-agent.md", "docs/camera.md",
+    "docs/crystal-agent.md", "docs/camera.md", "docs/first-agent.md",
 }  # fmt: skip
 SMALL = {
     "num_envs=10_000": "num_envs=100",

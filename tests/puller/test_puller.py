@@ -138,6 +138,7 @@ def test_names_are_found_beside_folders_of_the_same_name(tmp_path, monkeypatch):
         find_puller("other")
 
 
+@pytest.mark.slow
 def test_the_command_prints_what_a_file_implies(tmp_path, capsys):
     assert describe.main([str(file(tmp_path, "[crystal]\nradius_mm = 202\n[drives]\nheater_lag_s = [2, 5]"))]) == 0
     printed = capsys.readouterr()

@@ -162,6 +162,7 @@ def leaves(value, name=""):
         yield name, np.array(value, np.float64)
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_page_as_it_is(tmp_path, monkeypatch):
     """All but the last digits, which another machine may compute otherwise."""
     monkeypatch.chdir(ROOT)
