@@ -16,6 +16,8 @@ TEST_READY := $(VENV)/.ready-test
 BENCHMARK_READY := $(VENV)/.ready-benchmark
 DOCS_READY := $(VENV)/.ready-docs
 BROWSER_READY := $(VENV)/.ready-browser
+# Containers often set this: then each of the hundreds of processes that tests start compiles thousands of modules anew.
+unexport PYTHONDONTWRITEBYTECODE
 # A worker that runs out of tests takes some of the other's: files differ too much in time to be dealt out whole.
 IN_PARALLEL := --numprocesses auto --dist worksteal
 
