@@ -271,16 +271,14 @@ PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64), gamma=0.98, steps=96_
 that does not know the state sees less far, so the discount is shorter; ``ppo`` gains nothing by it at full length."""
 RECIPES: dict[str, TrainingConfig] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG(), PPOResidual())}
 """Recipes by name: the choices of ``cz-gym train --algo``."""
+_learned_std: dict[str, Any] = {"num_envs": 2048, "batch_size": 2048, "log_std_init": -0.7, "learn_std": True}
 _along: dict[str, Any] = {
     "environment": CRYSTAL_ENV,
     "stages": ("crown", "body", "tail"),
     "scenario": "randomized=0.5,hard=0.5",
 }
 CRYSTAL_RECIPES: dict[str, TrainingConfig] = {
-    "ppo": PPO(
-        name="ppo-along", steps=64_000_000, action="smooth", num_envs=2048, batch_size=2048, log_std_init=-0.7,
-        learn_std=True, **_along,
-    ),  # fmt: skip
+    "ppo": PPO(name="ppo-along", steps=64_000_000, action="smooth", **_learned_std, **_along),
     "gradient": APG(name="gradient-along", units=64, steps=17_280_000, **_along),
 }
 """Recipes of CzCrystal-v0: one agent for crown, body and tail."""
