@@ -9,12 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
+
 from cz_gym.agents import shipped
 from cz_gym.agents.recipes import (
     CRYSTAL_ENV,
     CRYSTAL_RECIPES,
     DEFAULT_RECIPE,
     FEW_UPDATES,
+    MOST,
     RECIPES,
     PPOResidual,
     TrainingConfig,
@@ -209,11 +212,19 @@ def _setting(text: str, recipe: TrainingConfig) -> tuple[str, Any]:
         typed = _typed(value, usual)
         if isinstance(usual, tuple) and Ellipsis not in get_args(known[name]) and len(typed) != len(usual):
             raise ValueError
+        if name in MOST and np.max(typed) > MOST[name]:
+            raise ValueError
         return name, typed
     except ValueError:
-        kinds = {tuple: "numbers with commas between", int: "a whole number from 1 on"}
-        kind = kinds.get(type(usual), type(usual).__name__)
-        raise CzError(f"--set {text}: {name} must be {kind}, as {usual!r}") from None
+        raise CzError(f"--set {text}: {name} must be {_meant(name, usual)}, as {usual!r}") from None
+
+
+def _meant(name: str, usual: Any) -> str:
+    """Say which values a field can have."""
+    if name in MOST:
+        return f"from 0 to {MOST[name]:g}"
+    kinds = {tuple: "numbers with commas between", int: "a whole number from 1 on", bool: "true or false"}
+    return kinds.get(type(usual)) or ("a number from 0 on" if usual > 0 else "a finite number")
 
 
 def _typed(text: str, usual: Any) -> Any:
