@@ -245,6 +245,7 @@ class SAC(Reinforcement):
     critic_hidden: tuple[int, ...] = (128, 128)
     steps: int = 12_000_000
     action: str = "rate"
+    gamma: float = 0.98
     num_envs: int = 512
     action_repeat: int = 4
     n_steps: int = 4
