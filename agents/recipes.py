@@ -17,6 +17,7 @@ import stable_baselines3
 import torch
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from cz_gym.body.signals import COST_CAP
@@ -31,6 +32,7 @@ from cz_gym.support.errors import CzError, require_type
 
 from . import apg
 from .asymmetric import AsymmetricPolicy, AsymmetricSACPolicy, RememberingPolicy
+from .callbacks import ClipAdvantages, FadeExploration
 from .contract import Contract, OnnxPolicy
 from .residual import Base, Residual
 
@@ -39,8 +41,8 @@ LEAST_ENVS, LEAST_BATCH = 8, 64
 BODY_ENV, CRYSTAL_ENV = ENVIRONMENTS
 FEW_UPDATES = 50
 """Number of updates below which nothing is learned."""
-MOST = {"gamma": 1.0, "gae_lambda": 1.0, "tau": 1.0, "betas": 0.9999}
-"""Largest value of the fields that have one: discounts, and what is forgotten at each step."""
+MOST = {"gamma": 1.0, "gae_lambda": 1.0, "tau": 1.0, "betas": 0.9999, "average": 1.0, "advantage_quantile": 1.0}
+"""Largest value of the fields that have one: discounts, what is forgotten at each step, and shares."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +71,8 @@ class TrainingConfig:
     stages: tuple[str, ...] = ()
     """Parts of the crystal that the training and validation crystals grow, in equal shares; none on Cz-v0."""
 
+    average: float = 0.0
+    """Share of the updates whose weights the kept agent is an exponential mean of; 0: it is the last one."""
     fewest_updates: int
     """Number of updates below which a smaller budget has fewer crystals at a time instead."""
 
@@ -91,6 +95,11 @@ class TrainingConfig:
         """Return the recipe with another budget; a small one has fewer crystals at a time, so that it still learns."""
         wanted = round(steps / (self.fewest_updates * self.steps_between))
         return replace(self, steps=steps, num_envs=min(self.num_envs, max(wanted, LEAST_ENVS)))
+
+    @property
+    def callbacks(self) -> list[BaseCallback]:
+        """Callbacks that the recipe learns with."""
+        return []
 
     @property
     def config(self) -> Config:
@@ -196,7 +205,7 @@ class PPO(Reinforcement):
 
     name: str = "ppo"
     hidden: tuple[int, ...] = (32, 32)
-    steps: int = 144_000_000
+    steps: int = 256_000_000
     action: str = "rate"
     """The heater's place on a puller whose meters err is kept by standing still; "smooth" must hold it by a reading."""
     num_envs: int = 1024
@@ -205,15 +214,28 @@ class PPO(Reinforcement):
     n_steps: int = 32
     fewest_updates: int = 90
     batch_size: int = 1024
-    n_epochs: int = 5
+    n_epochs: int = 2
+    """Few: new steps take less time than more passes through old ones, and their noise is their own."""
     learning_rate: float = 1e-3
     gae_lambda: float = 0.9
     """Lower than stable-baselines3's 0.95: a critic that reads the true state is a good judge."""
+    average: float = 0.02
     log_std_init: float = -1.2
     """Logarithm of the standard deviation of the actions in training, at its begin."""
+    log_std_end: float = -2.6
+    """The same at the end: first an action must be seen to do something, then the policy must suit what it does itself
+    and not what exploration does. No meaning with ``learn_std``."""
     learn_std: bool = False
     """Learn the standard deviation, which then shrinks, as small actions cost less, and hides what an action does; else
-    keep it."""
+    it falls linearly in its logarithm."""
+    advantage_quantile: float = 0.98
+    """Quantile of the size of a rollout's advantages at which they are clipped; 1 clips none."""
+
+    @property
+    def callbacks(self) -> list[BaseCallback]:
+        """The clipping of advantages, and the exploration that fades, unless it is learned."""
+        clipped = [ClipAdvantages(self.advantage_quantile)] if self.advantage_quantile < 1.0 else []
+        return [*clipped, *([] if self.learn_std else [FadeExploration(self.log_std_init, self.log_std_end)])]
 
     def with_steps(self, steps: int) -> Self:
         """Return the recipe with another budget, in whole batches."""
@@ -249,6 +271,7 @@ class SAC(Reinforcement):
     num_envs: int = 512
     action_repeat: int = 4
     n_steps: int = 4
+    average: float = 0.02
     fewest_updates: int = 4000
     buffer_size: int = 1_000_000
     learning_starts: int = 10_000
@@ -269,12 +292,14 @@ class SAC(Reinforcement):
         return self.action_repeat
 
 
-PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64), gamma=0.98, steps=96_000_000)
-"""As ``ppo``, but told nothing, with a wider actor, a shorter discount and two thirds of the steps. Beside ``ppo`` it
-shows what the true state is worth, though not alone."""
-RECIPES: dict[str, TrainingConfig] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG(), PPOResidual())}
+_steady: dict[str, Any] = {"n_epochs": 5, "average": 0.0, "log_std_end": -1.2, "advantage_quantile": 1.0}
+PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64), gamma=0.98, steps=96_000_000, **_steady)
+"""As ``ppo`` once learned: five epochs, exploration that stays, all advantages, the last weights; but told nothing,
+with a wider actor, a shorter discount and fewer steps."""
+BESIDE = PPOResidual(**_steady)
+RECIPES: dict[str, TrainingConfig] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG(), BESIDE)}
 """Recipes by name: the choices of ``cz-gym train --algo``."""
-_learned_std: dict[str, Any] = {"num_envs": 2048, "batch_size": 2048, "log_std_init": -0.7, "learn_std": True}
+_learned_std = {"num_envs": 2048, "batch_size": 2048, "log_std_init": -0.7, "learn_std": True, **_steady}
 _along: dict[str, Any] = {
     "environment": CRYSTAL_ENV,
     "stages": ("crown", "body", "tail"),

@@ -18,7 +18,7 @@ import time
 import traceback
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import parent_process
 from operator import attrgetter
@@ -40,6 +40,7 @@ from cz_gym.support.files import locked, write_files
 
 from . import recipes
 from .asymmetric import Asymmetric, LearnState
+from .callbacks import AverageWeights
 from .contract import MAX_JSON_BYTES, AgentFileError, OnnxPolicy, agent_files, read_bounded, read_json
 from .from_sb3 import to_agent
 from .recipes import TrainingConfig, make_algorithm, repeat_of
@@ -160,6 +161,8 @@ class TrainingRun:
     """Rows of ``progress.csv``."""
     best_cost: float | None = field(default=None, init=False)
     algorithm: BaseAlgorithm = field(init=False, repr=False)
+    averaged: AverageWeights | None = field(default=None, init=False, repr=False)
+    """Mean of the weights that the kept agent has; None if it has the last ones."""
 
     @property
     def sessions(self) -> list[dict[str, Any]]:
@@ -232,7 +235,12 @@ class TrainingRun:
         with deferred_interrupt() as interrupted:
             if self.steps < self.recipe.steps:
                 left = -(-(self.recipe.steps - self.steps) // repeat_of(self.recipe))
-                fits: list[BaseCallback] = [LearnState()] if isinstance(self.algorithm.policy, Asymmetric) else []
+                fits: list[BaseCallback] = self.recipe.callbacks
+                if isinstance(self.algorithm.policy, Asymmetric):
+                    fits.append(LearnState())
+                if self.recipe.average:
+                    self.averaged = AverageWeights(self.recipe.average * self.recipe.updates)
+                    fits.append(self.averaged)
                 fits += map(load_callback, self.callbacks)
                 self.algorithm.learn(left, [*fits, _Watch(self, bar, interrupted)], reset_num_timesteps=False)
             if not self.rows or int(self.rows[-1]["steps"]) < self.steps:
@@ -251,7 +259,8 @@ class TrainingRun:
         path, config = self.folder / "agent.onnx", self.recipe.config
         bar.set_description("validating")
         normalisation = self.algorithm.get_vec_normalize_env()
-        agent = to_agent(self.algorithm, self.recipe.name, self.seed, config, normalisation, path)
+        with self.averaged.applied() if self.averaged else nullcontext():
+            agent = to_agent(self.algorithm, self.recipe.name, self.seed, config, normalisation, path)
         figures = recipes.validate(agent, config, recipes.SELECTION_SEEDS)
         if self.best_cost is None or figures.cost < self.best_cost:
             self.best_cost = figures.cost

@@ -34,7 +34,7 @@ class SmallRun(TrainingRun):
 def learned(algorithm: Any, recipe: TrainingConfig) -> Any:
     """The algorithm after what is left of the recipe's steps, as a run lets it learn."""
     left = recipe.steps // repeat_of(recipe) - algorithm.num_timesteps
-    fits = [LearnState()] if isinstance(recipe, PPO) else None
+    fits = [*recipe.callbacks, *([LearnState()] if isinstance(recipe, PPO) else [])]
     return algorithm.learn(left, fits, reset_num_timesteps=False)
 
 

@@ -11,16 +11,19 @@ import sys
 from dataclasses import asdict, replace
 from functools import cache
 from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 import torch
+from stable_baselines3.common.callbacks import BaseCallback
 from tqdm import tqdm
 
 from cz_gym import CzEnv
 from cz_gym.agents import AgentFileError, OnnxPolicy, load, recipes
 from cz_gym.agents import train as training
 from cz_gym.agents.asymmetric import LearnState
+from cz_gym.agents.callbacks import AverageWeights, ClipAdvantages
 from cz_gym.agents.recipes import CRYSTAL_RECIPES, PPO, RECIPES, PPOResidual, make_algorithm
 from cz_gym.agents.train import CHECKPOINT, TrainingRun, load_checkpoint, restore, to_bytes
 from cz_gym.config import make_config
@@ -217,7 +220,7 @@ def test_ctrl_c_in_the_middle_of_an_update_saves_after_it(tmp_path, monkeypatch,
         (["--scenario", "none.py:quiet"], "none.py: no such file"),
         (["--resume"], "nothing to resume"),
         (["--set", "learning_rat=1"], "unknown field 'learning_rat': did you mean 'learning_rate'?"),
-        (["--set", "n_epochs=few"], "--set n_epochs=few: n_epochs must be a whole number from 1 on, as 5"),
+        (["--set", "n_epochs=few"], "--set n_epochs=few: n_epochs must be a whole number from 1 on, as 2"),
         (["--set", "num_envs=0"], "num_envs must be a whole number from 1 on, as 1024"),
         (["--set", "learning_rate=-1"], "learning_rate must be a number from 0 on, as 0.001"),
         (["--set", "log_std_init=nan"], "log_std_init must be a finite number, as -1.2"),
@@ -438,11 +441,52 @@ def test_a_small_budget_has_fewer_crystals_and_smaller_batches(name, batch):
     assert recipe.with_steps(recipe.steps) == recipe
 
 
-@pytest.mark.parametrize("learns", [False, True])
-def test_exploration_shrinks_only_where_a_recipe_says_so(learns):
-    recipe = replace(SMALL, learn_std=learns)
-    log_std = trained(recipe).policy.log_std.tolist()
-    assert (log_std == pytest.approx([recipe.log_std_init] * 2, abs=1e-7)) != learns
+def test_exploration_falls_by_schedule_unless_it_is_learned():
+    """The second of two rollouts has the standard deviation of half way."""
+    fading, learning = trained(replace(SMALL, steps=256)), trained(replace(SMALL, learn_std=True))
+    half_way = 0.5 * (SMALL.log_std_init + SMALL.log_std_end)
+    assert fading.policy.log_std.tolist() == pytest.approx([half_way] * 2, abs=1e-6)
+    assert learning.policy.log_std.tolist() != pytest.approx([SMALL.log_std_init] * 2, abs=1e-7)
+    assert learning.policy.log_std.tolist() == pytest.approx([SMALL.log_std_init] * 2, abs=0.1)
+
+
+def test_advantages_are_clipped_at_a_quantile_of_their_size():
+    learner = make_algorithm(SMALL, 0)
+    learner.learn(SMALL.steps // SMALL.action_repeat, LearnState())
+    advantages = learner.rollout_buffer.advantages
+    mean, before = advantages.mean(), advantages.copy()
+    clip = ClipAdvantages(0.75)
+    clip.init_callback(learner)
+    clip.on_rollout_end()
+    most = np.abs(advantages).max()
+    assert np.mean(np.abs(advantages) > 0.999 * most) == pytest.approx(0.25, abs=0.05)
+    np.testing.assert_allclose(advantages, np.clip(before - mean, -most, most), rtol=1e-5)
+
+
+def test_the_kept_agent_has_the_mean_of_the_last_weights_and_learning_goes_on_from_its_own():
+    class Log(BaseCallback):
+        """Weights of the actor's last layer at each begin of a rollout."""
+
+        weights: ClassVar[list[Any]] = []
+
+        def _on_step(self):
+            return True
+
+        def _on_rollout_start(self):
+            self.weights.append(self.model.policy.action_net.weight.detach().clone())
+
+    averaged, log = AverageWeights(2.0), Log()
+    learner = make_algorithm(replace(SMALL, steps=4 * 128), 0)
+    learner.learn(256, [LearnState(), averaged, log])
+    first, *others = log.weights
+    expected = first
+    for share, weights in zip([1 / 2] * len(others), others, strict=True):
+        expected = expected + share * (weights - expected)
+    own = learner.policy.action_net.weight.detach().clone()
+    with averaged.applied():
+        torch.testing.assert_close(learner.policy.action_net.weight.detach(), expected)
+    assert torch.equal(learner.policy.action_net.weight, own)
+    assert len(log.weights) > 3
 
 
 SEEDS = range(1_000_000, 1_000_006)
