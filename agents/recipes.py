@@ -5,6 +5,7 @@ A new recipe needs a line in :data:`RECIPES`; a new kind needs a dataclass here 
 """
 
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
@@ -39,6 +40,8 @@ from .residual import Base, Residual
 LEAST_ENVS, LEAST_BATCH = 8, 64
 """Least number of crystals at a time, and of samples in a batch, on a small budget."""
 BODY_ENV, CRYSTAL_ENV = ENVIRONMENTS
+MOST_EPOCHS = 5
+"""Most passes of PPO through a rollout, on a small budget."""
 FEW_UPDATES = 50
 """Number of updates below which nothing is learned."""
 MOST = {"gamma": 1.0, "gae_lambda": 1.0, "tau": 1.0, "betas": 0.9999, "average": 1.0, "advantage_quantile": 1.0}
@@ -238,10 +241,12 @@ class PPO(Reinforcement):
         return [*clipped, *([] if self.learn_std else [FadeExploration(self.log_std_init, self.log_std_end)])]
 
     def with_steps(self, steps: int) -> Self:
-        """Return the recipe with another budget, in whole batches."""
+        """Return the recipe with another budget, in whole batches; with a quarter of the steps twice the passes."""
         fewer = super().with_steps(steps)
         collected = fewer.num_envs * fewer.n_steps
-        return replace(fewer, batch_size=max(n for n in range(1, fewer.batch_size + 1) if collected % n == 0))
+        batch_size = max(n for n in range(1, fewer.batch_size + 1) if collected % n == 0)
+        passes = min(round(self.n_epochs * math.sqrt(self.steps / steps)), MOST_EPOCHS)
+        return replace(fewer, batch_size=batch_size, n_epochs=max(passes, self.n_epochs))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,7 +276,6 @@ class SAC(Reinforcement):
     num_envs: int = 512
     action_repeat: int = 4
     n_steps: int = 4
-    average: float = 0.02
     fewest_updates: int = 4000
     buffer_size: int = 1_000_000
     learning_starts: int = 10_000

@@ -441,6 +441,12 @@ def test_a_small_budget_has_fewer_crystals_and_smaller_batches(name, batch):
     assert recipe.with_steps(recipe.steps) == recipe
 
 
+def test_a_quarter_of_the_steps_has_twice_the_passes_up_to_five():
+    ppo = RECIPES["ppo"]
+    assert [ppo.with_steps(ppo.steps // share).n_epochs for share in (1, 4, 1000)] == [2, 4, 5]
+    assert ppo.with_steps(4 * ppo.steps).n_epochs == 2
+
+
 def test_exploration_falls_by_schedule_unless_it_is_learned():
     """The second of two rollouts has the standard deviation of half way."""
     fading, learning = trained(replace(SMALL, steps=256)), trained(replace(SMALL, learn_std=True))
