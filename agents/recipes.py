@@ -5,7 +5,6 @@ A new recipe needs a line in :data:`RECIPES`; a new kind needs a dataclass here 
 """
 
 import inspect
-import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
@@ -40,8 +39,10 @@ from .residual import Base, Residual
 LEAST_ENVS, LEAST_BATCH = 8, 64
 """Least number of crystals at a time, and of samples in a batch, on a small budget."""
 BODY_ENV, CRYSTAL_ENV = ENVIRONMENTS
-MOST_EPOCHS = 5
-"""Most passes of PPO through a rollout, on a small budget."""
+MANY_STEPS = 64_000_000
+"""Budget of PPO from which on its remedies against noise pay [environment steps]."""
+FEW_STEPS: dict[str, Any] = {"n_epochs": 5, "average": 0.0, "log_std_end": -1.2, "advantage_quantile": 1.0}
+"""Fields of a PPO with fewer steps: more passes, and all of the large advantages, which show what loses a crystal."""
 FEW_UPDATES = 50
 """Number of updates below which nothing is learned."""
 MOST = {"gamma": 1.0, "gae_lambda": 1.0, "tau": 1.0, "betas": 0.9999, "average": 1.0, "advantage_quantile": 1.0}
@@ -241,12 +242,10 @@ class PPO(Reinforcement):
         return [*clipped, *([] if self.learn_std else [FadeExploration(self.log_std_init, self.log_std_end)])]
 
     def with_steps(self, steps: int) -> Self:
-        """Return the recipe with another budget, in whole batches; with a quarter of the steps twice the passes."""
-        fewer = super().with_steps(steps)
+        """Return the recipe with another budget, in whole batches; a small one learns by :data:`FEW_STEPS`."""
+        fewer = super(PPO, self if steps >= MANY_STEPS else replace(self, **FEW_STEPS)).with_steps(steps)
         collected = fewer.num_envs * fewer.n_steps
-        batch_size = max(n for n in range(1, fewer.batch_size + 1) if collected % n == 0)
-        passes = min(round(self.n_epochs * math.sqrt(self.steps / steps)), MOST_EPOCHS)
-        return replace(fewer, batch_size=batch_size, n_epochs=max(passes, self.n_epochs))
+        return replace(fewer, batch_size=max(n for n in range(1, fewer.batch_size + 1) if collected % n == 0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -296,14 +295,13 @@ class SAC(Reinforcement):
         return self.action_repeat
 
 
-_steady: dict[str, Any] = {"n_epochs": 5, "average": 0.0, "log_std_end": -1.2, "advantage_quantile": 1.0}
-PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64), gamma=0.98, steps=96_000_000, **_steady)
-"""As ``ppo`` once learned: five epochs, exploration that stays, all advantages, the last weights; but told nothing,
-with a wider actor, a shorter discount and fewer steps."""
-BESIDE = PPOResidual(**_steady)
+PLAIN = PPO(name="ppo-plain", told=False, hidden=(64, 64), gamma=0.98, steps=96_000_000, **FEW_STEPS)
+"""As ``ppo`` with few steps: five epochs, exploration that stays, all advantages, the last weights; but told nothing,
+with a wider actor, a shorter discount and 96 million steps."""
+BESIDE = PPOResidual(**FEW_STEPS)
 RECIPES: dict[str, TrainingConfig] = {recipe.name: recipe for recipe in (PPO(), PLAIN, SAC(), APG(), BESIDE)}
 """Recipes by name: the choices of ``cz-gym train --algo``."""
-_learned_std = {"num_envs": 2048, "batch_size": 2048, "log_std_init": -0.7, "learn_std": True, **_steady}
+_learned_std = {"num_envs": 2048, "batch_size": 2048, "log_std_init": -0.7, "learn_std": True, **FEW_STEPS}
 _along: dict[str, Any] = {
     "environment": CRYSTAL_ENV,
     "stages": ("crown", "body", "tail"),

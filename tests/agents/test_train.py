@@ -24,7 +24,7 @@ from cz_gym.agents import AgentFileError, OnnxPolicy, load, recipes
 from cz_gym.agents import train as training
 from cz_gym.agents.asymmetric import LearnState
 from cz_gym.agents.callbacks import AverageWeights, ClipAdvantages
-from cz_gym.agents.recipes import CRYSTAL_RECIPES, PPO, RECIPES, PPOResidual, make_algorithm
+from cz_gym.agents.recipes import CRYSTAL_RECIPES, MANY_STEPS, PPO, RECIPES, PPOResidual, make_algorithm
 from cz_gym.agents.train import CHECKPOINT, TrainingRun, load_checkpoint, restore, to_bytes
 from cz_gym.config import make_config
 from cz_gym.evaluation.metrics import metrics
@@ -441,10 +441,12 @@ def test_a_small_budget_has_fewer_crystals_and_smaller_batches(name, batch):
     assert recipe.with_steps(recipe.steps) == recipe
 
 
-def test_a_quarter_of_the_steps_has_twice_the_passes_up_to_five():
+def test_a_small_budget_of_ppo_keeps_its_exploration_and_its_large_advantages():
     ppo = RECIPES["ppo"]
-    assert [ppo.with_steps(ppo.steps // share).n_epochs for share in (1, 4, 1000)] == [2, 4, 5]
-    assert ppo.with_steps(4 * ppo.steps).n_epochs == 2
+    few, many = ppo.with_steps(MANY_STEPS - 1), ppo.with_steps(MANY_STEPS)
+    assert (few.n_epochs, few.average, few.advantage_quantile) == (5, 0.0, 1.0)
+    assert few.log_std_end == few.log_std_init
+    assert replace(many, steps=ppo.steps) == ppo
 
 
 def test_exploration_falls_by_schedule_unless_it_is_learned():
