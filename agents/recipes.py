@@ -243,7 +243,8 @@ class PPO(Reinforcement):
 
     def with_steps(self, steps: int) -> Self:
         """Return the recipe with another budget, in whole batches; a small one learns by :data:`FEW_STEPS`."""
-        fewer = super(PPO, self if steps >= MANY_STEPS else replace(self, **FEW_STEPS)).with_steps(steps)
+        own = replace(self, **FEW_STEPS) if steps < MANY_STEPS <= self.steps else self
+        fewer = super(PPO, own).with_steps(steps)
         collected = fewer.num_envs * fewer.n_steps
         return replace(fewer, batch_size=max(n for n in range(1, fewer.batch_size + 1) if collected % n == 0))
 

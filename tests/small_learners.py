@@ -13,7 +13,10 @@ SMALL_SAC = SAC(
     num_envs=4, hidden=(16, 16), steps=256, buffer_size=256, learning_starts=32, batch_size=16, gradient_steps=1
 )
 SMALL_APG = APG(num_envs=4, window=20, steps=160)
-QUICK = PPO(num_envs=64, action_repeat=2, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,), fewest_updates=1)
+QUICK = PPO(
+    num_envs=64, action_repeat=2, steps=32_000_000, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,),
+    fewest_updates=1,
+)  # fmt: skip
 """For runs of ``train.py``."""
 REFERENCES = dict.fromkeys(recipes.REFERENCES["Cz-v0"], (0.2, 0.1))
 TRAIN = TrainingRun.train
