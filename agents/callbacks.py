@@ -37,7 +37,7 @@ class AverageWeights(BaseCallback):
         weights = list(self.model.policy.parameters())
         own = [each.detach().clone() for each in weights]
         try:
-            _copy(self.means, weights)
+            _copy(self.means or own, weights)  # no mean before the first rollout
             yield
         finally:
             _copy(own, weights)
@@ -45,16 +45,16 @@ class AverageWeights(BaseCallback):
 
 def _copy(values: list[torch.Tensor], weights: list[torch.nn.Parameter]) -> None:
     with torch.no_grad():
-        for value, weight in zip(values, weights, strict=False):  # no value before the first rollout
+        for value, weight in zip(values, weights, strict=True):
             weight.copy_(value)
 
 
 class FadeExploration(BaseCallback):
-    """Lets the logarithm of PPO's standard deviation fall linearly with the steps, from one value to another."""
+    """Lets the logarithm of PPO's standard deviation fall linearly with the steps, from ``start`` by ``fall``."""
 
-    def __init__(self, start: float, end: float) -> None:
+    def __init__(self, start: float, fall: float) -> None:
         super().__init__()
-        self.start, self.end = start, end
+        self.start, self.end = start, start - fall
 
     def _on_step(self) -> bool:
         return True
@@ -66,10 +66,10 @@ class FadeExploration(BaseCallback):
 
 
 class ClipAdvantages(BaseCallback):
-    """Clips PPO's advantages, less their mean, at a quantile of their size.
+    """Clips PPO's advantages, less their mean, at a quantile of their size; the critic's targets stay.
 
-    Most of their variance lies in one in a hundred, from crystals that are about to be lost and the like, where much
-    else than the action decides.
+    A few of them, from crystals that go wrong, would else make most of the gradient, and much else than the action
+    decides how large they are.
     """
 
     def __init__(self, quantile: float) -> None:

@@ -445,14 +445,14 @@ def test_a_small_budget_of_ppo_keeps_its_exploration_and_its_large_advantages():
     ppo = RECIPES["ppo"]
     few, many = ppo.with_steps(MANY_STEPS - 1), ppo.with_steps(MANY_STEPS)
     assert (few.n_epochs, few.average, few.advantage_quantile) == (5, 0.0, 1.0)
-    assert few.log_std_end == few.log_std_init
+    assert few.log_std_fall == 0.0
     assert replace(many, steps=ppo.steps) == ppo
 
 
 def test_exploration_falls_by_schedule_unless_it_is_learned():
     """The second of two rollouts has the standard deviation of half way."""
     fading, learning = trained(replace(SMALL, steps=256)), trained(replace(SMALL, learn_std=True))
-    half_way = 0.5 * (SMALL.log_std_init + SMALL.log_std_end)
+    half_way = SMALL.log_std_init - 0.5 * SMALL.log_std_fall
     assert fading.policy.log_std.tolist() == pytest.approx([half_way] * 2, abs=1e-6)
     assert learning.policy.log_std.tolist() != pytest.approx([SMALL.log_std_init] * 2, abs=1e-7)
     assert learning.policy.log_std.tolist() == pytest.approx([SMALL.log_std_init] * 2, abs=0.1)
@@ -462,13 +462,14 @@ def test_advantages_are_clipped_at_a_quantile_of_their_size():
     learner = make_algorithm(SMALL, 0)
     learner.learn(SMALL.steps // SMALL.action_repeat, LearnState())
     advantages = learner.rollout_buffer.advantages
-    mean, before = advantages.mean(), advantages.copy()
+    mean, before, returns = advantages.mean(), advantages.copy(), learner.rollout_buffer.returns.copy()
     clip = ClipAdvantages(0.75)
     clip.init_callback(learner)
     clip.on_rollout_end()
     most = np.abs(advantages).max()
     assert np.mean(np.abs(advantages) > 0.999 * most) == pytest.approx(0.25, abs=0.05)
     np.testing.assert_allclose(advantages, np.clip(before - mean, -most, most), rtol=1e-5)
+    np.testing.assert_array_equal(learner.rollout_buffer.returns, returns)
 
 
 def test_the_kept_agent_has_the_mean_of_the_last_weights_and_learning_goes_on_from_its_own():
@@ -486,10 +487,9 @@ def test_the_kept_agent_has_the_mean_of_the_last_weights_and_learning_goes_on_fr
     averaged, log = AverageWeights(2.0), Log()
     learner = make_algorithm(replace(SMALL, steps=4 * 128), 0)
     learner.learn(256, [LearnState(), averaged, log])
-    first, *others = log.weights
-    expected = first
-    for share, weights in zip([1 / 2] * len(others), others, strict=True):
-        expected = expected + share * (weights - expected)
+    expected, *others = log.weights
+    for weights in others:
+        expected = 0.5 * (expected + weights)
     own = learner.policy.action_net.weight.detach().clone()
     with averaged.applied():
         torch.testing.assert_close(learner.policy.action_net.weight.detach(), expected)
