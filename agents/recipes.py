@@ -31,7 +31,7 @@ from cz_gym.sb3 import ActionRepeat, AddToController, CzVecEnv, LongMemory
 from cz_gym.support.errors import CzError, require_type
 
 from . import apg
-from .asymmetric import AsymmetricPolicy, AsymmetricSACPolicy, RememberingPolicy
+from .asymmetric import AsymmetricPolicy, AsymmetricSACPolicy, LearnState, RememberingPolicy
 from .callbacks import ClipAdvantages, FadeExploration
 from .contract import Contract, OnnxPolicy
 from .residual import Base, Residual
@@ -102,8 +102,8 @@ class TrainingConfig:
         return replace(self, steps=steps, num_envs=min(self.num_envs, max(wanted, LEAST_ENVS)))
 
     @property
-    def callbacks(self) -> list[BaseCallback]:
-        """Callbacks that the recipe learns with."""
+    def own_callbacks(self) -> list[BaseCallback]:
+        """Callbacks that the recipe learns with, whatever a user adds."""
         return []
 
     @property
@@ -193,6 +193,11 @@ class Reinforcement(TrainingConfig):
     """Actions on each crystal between updates of PPO; actions whose rewards a target of SAC has."""
 
     @property
+    def own_callbacks(self) -> list[BaseCallback]:
+        """The fit of the estimate, where the true state is told."""
+        return [LearnState()] if self.told else []
+
+    @property
     def steps_between(self) -> int:
         """Length of PPO's rollout."""
         return self.action_repeat * self.n_steps
@@ -237,10 +242,14 @@ class PPO(Reinforcement):
     """Quantile of the size of a rollout's advantages at which they are clipped; 1 clips none."""
 
     @property
-    def callbacks(self) -> list[BaseCallback]:
+    def own_callbacks(self) -> list[BaseCallback]:
         """The clipping of advantages, and the exploration that fades, unless it is learned."""
-        clipped = [ClipAdvantages(self.advantage_quantile)] if self.advantage_quantile < 1.0 else []
-        return [*clipped, *([] if self.learn_std else [FadeExploration(self.log_std_init, self.log_std_fall)])]
+        wanted = super().own_callbacks
+        if self.advantage_quantile < 1.0:
+            wanted.append(ClipAdvantages(self.advantage_quantile))
+        if self.log_std_fall and not self.learn_std:
+            wanted.append(FadeExploration(self.log_std_init, self.log_std_fall))
+        return wanted
 
     def with_steps(self, steps: int) -> Self:
         """Return the recipe with another budget, in whole batches; a small one learns by :data:`FEW_STEPS`."""

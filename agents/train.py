@@ -39,7 +39,6 @@ from cz_gym.support.errors import CzError, software
 from cz_gym.support.files import locked, write_files
 
 from . import recipes
-from .asymmetric import Asymmetric, LearnState
 from .callbacks import AverageWeights
 from .contract import MAX_JSON_BYTES, AgentFileError, OnnxPolicy, agent_files, read_bounded, read_json
 from .from_sb3 import to_agent
@@ -235,9 +234,7 @@ class TrainingRun:
         with deferred_interrupt() as interrupted:
             if self.steps < self.recipe.steps:
                 left = -(-(self.recipe.steps - self.steps) // repeat_of(self.recipe))
-                fits: list[BaseCallback] = self.recipe.callbacks
-                if isinstance(self.algorithm.policy, Asymmetric):
-                    fits.append(LearnState())
+                fits = self.recipe.own_callbacks
                 if self.recipe.average:
                     self.averaged = AverageWeights(self.recipe.average * self.recipe.updates)
                     fits.append(self.averaged)

@@ -3,7 +3,6 @@
 from typing import Any
 
 from cz_gym.agents import recipes
-from cz_gym.agents.asymmetric import LearnState
 from cz_gym.agents.recipes import APG, PPO, SAC, TrainingConfig, make_algorithm, repeat_of
 from cz_gym.agents.train import TrainingRun
 from cz_gym.evaluation.protocol import VALIDATION_SEEDS
@@ -37,8 +36,7 @@ class SmallRun(TrainingRun):
 def learned(algorithm: Any, recipe: TrainingConfig) -> Any:
     """The algorithm after what is left of the recipe's steps, as a run lets it learn."""
     left = recipe.steps // repeat_of(recipe) - algorithm.num_timesteps
-    fits = [*recipe.callbacks, *([LearnState()] if isinstance(recipe, PPO) else [])]
-    return algorithm.learn(left, fits, reset_num_timesteps=False)
+    return algorithm.learn(left, recipe.own_callbacks, reset_num_timesteps=False)
 
 
 def trained(recipe: TrainingConfig, seed: int = 0) -> Any:

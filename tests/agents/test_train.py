@@ -497,6 +497,18 @@ def test_the_kept_agent_has_the_mean_of_the_last_weights_and_learning_goes_on_fr
     assert len(log.weights) > 3
 
 
+def test_averaging_changes_the_kept_agent_and_not_the_learning(tmp_path):
+    found = []
+    for share in (0.0, 1.0):
+        run = SmallRun(tmp_path / f"{share}", replace(SMALL, steps=4 * 128, average=share), 0, REFERENCES)
+        run.train()
+        weights = run.algorithm.policy.action_net.weight.detach()
+        found.append((weights, OnnxPolicy.load(run.folder / "agent.onnx").content))
+    (last, kept), (same, mean) = found
+    assert torch.equal(last, same)
+    assert kept != mean
+
+
 SEEDS = range(1_000_000, 1_000_006)
 
 
