@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
+from torch.utils.hooks import RemovableHandle
 
 
 class AverageWeights(BaseCallback):
@@ -50,7 +52,10 @@ def _copy(values: list[torch.Tensor], weights: list[torch.nn.Parameter]) -> None
 
 
 class FadeExploration(BaseCallback):
-    """Lets the logarithm of PPO's standard deviation fall linearly with the steps, from ``start`` by ``fall``."""
+    """Lets exploration fall linearly with the steps, from ``start`` by ``fall``.
+
+    It is measured by the logarithm of the standard deviation of PPO's actions, and by SAC's ``target_entropy``.
+    """
 
     def __init__(self, start: float, fall: float) -> None:
         super().__init__()
@@ -61,8 +66,11 @@ class FadeExploration(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         model: Any = self.model
-        left: float = model._current_progress_remaining
-        model.policy.log_std.data.fill_(self.end + (self.start - self.end) * left)
+        value: float = self.end + (self.start - self.end) * model._current_progress_remaining
+        if isinstance(model, SAC):
+            model.target_entropy = value
+        else:
+            model.policy.log_std.data.fill_(value)
 
 
 class ClipAdvantages(BaseCallback):
@@ -85,3 +93,36 @@ class ClipAdvantages(BaseCallback):
         advantages -= advantages.mean()
         most = np.quantile(np.abs(advantages), self.quantile)
         np.clip(advantages, -most, most, out=advantages)
+
+
+class ClipErrors(BaseCallback):
+    """Clips the errors of SAC's critics at a quantile of their size in the batch, as Huber's loss does.
+
+    One error in a hundred would else make half of the gradient.
+    """
+
+    hook: RemovableHandle
+
+    def __init__(self, quantile: float) -> None:
+        super().__init__()
+        self.quantile = quantile
+
+    def _on_training_start(self) -> None:
+        model: Any = self.model
+        self.hook = model.critic.register_forward_hook(self._watch)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_end(self) -> None:
+        self.hook.remove()
+
+    def _watch(self, critic: Any, inputs: tuple[torch.Tensor, ...], values: tuple[Any, ...]) -> None:
+        _, actions = inputs
+        if torch.is_grad_enabled() and not actions.requires_grad:  # the critics' loss; the actor's follows its actions
+            for each in values:
+                each.register_hook(self._clipped)
+
+    def _clipped(self, errors: torch.Tensor) -> torch.Tensor:
+        most = errors.abs().quantile(self.quantile)
+        return errors.clamp(-most, most)

@@ -18,6 +18,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from cz_gym.body.signals import COST_CAP
@@ -32,7 +33,7 @@ from cz_gym.support.errors import CzError, require_type
 
 from . import apg
 from .asymmetric import AsymmetricPolicy, AsymmetricSACPolicy, LearnState, RememberingPolicy
-from .callbacks import ClipAdvantages, FadeExploration
+from .callbacks import ClipAdvantages, ClipErrors, FadeExploration
 from .contract import Contract, OnnxPolicy
 from .residual import Base, Residual
 
@@ -46,7 +47,8 @@ FEW_STEPS: dict[str, Any] = {"n_epochs": 5, "average": 0.0, "log_std_fall": 0.0,
 """Fields of a PPO with fewer steps: more passes, and all of the large advantages, which show what loses a crystal."""
 FEW_UPDATES = 50
 """Number of updates below which nothing is learned."""
-MOST = {"gamma": 1.0, "gae_lambda": 1.0, "tau": 1.0, "betas": 0.9999, "average": 1.0, "advantage_quantile": 1.0}
+_SHARES = "gamma", "gae_lambda", "tau", "average", "advantage_quantile", "error_quantile"
+MOST = {**dict.fromkeys(_SHARES, 1.0), "betas": 0.9999}
 """Largest value of the fields that have one: discounts, what is forgotten at each step, and shares."""
 
 
@@ -295,11 +297,31 @@ class SAC(Reinforcement):
     gradient_steps: int = 4
     """Updates after each action of all crystals."""
     learning_rate: float = 5e-4
+    n_critics: int = 2
+    """Critics, of whose values the lower one counts. One takes half the time: twice as many updates fit into it."""
     tau: float = 0.01
     ent_coef: str = "auto_0.005"
     """Initial weight of the entropy; it adapts."""
     target_entropy: float = 0.5
-    """Entropy of an action's distribution that the weight adapts to: a standard deviation of 0.3 in each drive."""
+    """Entropy of an action's distribution that the weight adapts to, at the begin of training: 0.5 is a standard
+    deviation of 0.3 in the pull's drive and 0.5 in the heater's."""
+    entropy_fall: float = 0.0
+    """Fall of it until the end."""
+    action_noise_std: float = 0.0
+    """Standard deviation of what training adds to the policy's actions, so that the critic sees what actions do while
+    the policy's own become narrow."""
+    error_quantile: float = 1.0
+    """Quantile of the size of a batch's errors of the critics at which they are clipped; 1 clips none."""
+
+    @property
+    def own_callbacks(self) -> list[BaseCallback]:
+        """The clipping of the critics' errors, and the exploration that fades."""
+        wanted = super().own_callbacks
+        if self.error_quantile < 1.0:
+            wanted.append(ClipErrors(self.error_quantile))
+        if self.entropy_fall:
+            wanted.append(FadeExploration(self.target_entropy, self.entropy_fall))
+        return wanted
 
     @property
     def steps_between(self) -> int:
@@ -349,7 +371,7 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base 
             options = {"log_std_init": recipe.log_std_init}
         case SAC():
             kind, policy, critics = stable_baselines3.SAC, AsymmetricSACPolicy, "qf"
-            options = {"activation_fn": torch.nn.Tanh}
+            options = {"activation_fn": torch.nn.Tanh, "n_critics": recipe.n_critics}
         case _:
             raise TypeError(f"no algorithm for a {type(recipe).__name__}")
     known = {name for each in kind.__mro__ for name in inspect.signature(each.__init__).parameters}
@@ -360,6 +382,8 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base 
         options["net_arch"] = {"pi": list(recipe.hidden), critics: list(recipe.critic_hidden)}
     if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer
         settings["learning_starts"] += done // recipe.action_repeat
+        if recipe.action_noise_std:
+            settings["action_noise"] = NormalActionNoise(np.zeros(2), np.full(2, recipe.action_noise_std))
     made: BaseAlgorithm = kind(policy, env, policy_kwargs=options, seed=seed, device="cpu", **settings)
     if isinstance(recipe, PPO):
         made.policy.log_std.requires_grad_(recipe.learn_std)

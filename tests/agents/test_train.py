@@ -23,7 +23,7 @@ from cz_gym import CzEnv
 from cz_gym.agents import AgentFileError, OnnxPolicy, load, recipes
 from cz_gym.agents import train as training
 from cz_gym.agents.asymmetric import LearnState
-from cz_gym.agents.callbacks import AverageWeights, ClipAdvantages
+from cz_gym.agents.callbacks import AverageWeights, ClipAdvantages, ClipErrors
 from cz_gym.agents.recipes import CRYSTAL_RECIPES, MANY_STEPS, PPO, RECIPES, PPOResidual, make_algorithm
 from cz_gym.agents.train import CHECKPOINT, TrainingRun, load_checkpoint, restore, to_bytes
 from cz_gym.config import make_config
@@ -470,6 +470,51 @@ def test_advantages_are_clipped_at_a_quantile_of_their_size():
     assert np.mean(np.abs(advantages) > 0.999 * most) == pytest.approx(0.25, abs=0.05)
     np.testing.assert_allclose(advantages, np.clip(before - mean, -most, most), rtol=1e-5)
     np.testing.assert_array_equal(learner.rollout_buffer.returns, returns)
+
+
+def test_the_target_of_sac_s_entropy_falls_with_the_steps():
+    learner = trained(SMALL_SAC)
+    last = SMALL_SAC.num_envs * SMALL_SAC.action_repeat / SMALL_SAC.steps
+    assert learner.target_entropy == pytest.approx(SMALL_SAC.target_entropy - (1.0 - last) * SMALL_SAC.entropy_fall)
+
+
+def test_sac_tries_wider_actions_than_its_policy_s():
+    def tried(std):
+        recipe = replace(SMALL_SAC, steps=128, action_noise_std=std, learning_starts=0, gradient_steps=0)
+        return np.array(trained(recipe).replay_buffer.actions[:8])
+
+    policy, wider = tried(0.0), tried(0.2)
+    assert 0.1 < np.std(wider[0] - policy[0]) < 0.4
+    assert np.abs(wider).max() <= 1.0
+
+
+def test_a_critic_s_large_errors_are_clipped_and_the_actor_s_gradient_is_not():
+    learner = make_algorithm(SMALL_SAC, 0)
+    learner.learn(8, LearnState())
+    seen = torch.as_tensor(learner.env.reset())
+    actions, targets = torch.zeros(4, 2), torch.tensor([[0.0], [0.1], [-0.2], [5.0]])
+
+    def slopes(actions):
+        """Gradients of the critic's last bias and of the actions, of half a mean squared error."""
+        (values,) = learner.critic(seen, actions)
+        (0.5 * (values - values.detach() + targets).square().mean()).backward()
+        bias = learner.critic.q_networks[0][-1].bias
+        slope = bias.grad.item()
+        learner.critic.zero_grad()
+        return slope, actions.grad
+
+    exact, _ = slopes(actions)
+    asked = actions.clone().requires_grad_()
+    _, exact_actions = slopes(asked)
+    clip = ClipErrors(2 / 3)
+    clip.init_callback(learner)
+    clip.on_training_start({}, {})
+    assert exact == pytest.approx(targets.mean().item())
+    assert slopes(actions)[0] == pytest.approx((0.0 + 0.1 - 0.2 + 0.2) / 4)
+    again = actions.clone().requires_grad_()
+    torch.testing.assert_close(slopes(again)[1], exact_actions)
+    clip.on_training_end()
+    assert slopes(actions)[0] == pytest.approx(exact)
 
 
 def test_the_kept_agent_has_the_mean_of_the_last_weights_and_learning_goes_on_from_its_own():
