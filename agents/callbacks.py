@@ -98,7 +98,7 @@ class ClipAdvantages(BaseCallback):
 class ClipErrors(BaseCallback):
     """Clips the errors of SAC's critics at a quantile of their size in the batch, as Huber's loss does.
 
-    One error in a hundred would else make half of the gradient.
+    A few large ones, which the action hardly decides, would else make most of the loss.
     """
 
     hook: RemovableHandle

@@ -19,6 +19,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from cz_gym.body.signals import COST_CAP
@@ -47,9 +48,9 @@ FEW_STEPS: dict[str, Any] = {"n_epochs": 5, "average": 0.0, "log_std_fall": 0.0,
 """Fields of a PPO with fewer steps: more passes, and all of the large advantages, which show what loses a crystal."""
 FEW_UPDATES = 50
 """Number of updates below which nothing is learned."""
-_SHARES = "gamma", "gae_lambda", "tau", "average", "advantage_quantile", "error_quantile"
+_SHARES = "gamma", "gae_lambda", "tau", "average", "advantage_quantile", "error_quantile", "action_noise_std"
 MOST = {**dict.fromkeys(_SHARES, 1.0), "betas": 0.9999}
-"""Largest value of the fields that have one: discounts, what is forgotten at each step, and shares."""
+"""Largest value of the fields that have one: discounts, what is forgotten at each step, shares, and noise."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -303,8 +304,8 @@ class SAC(Reinforcement):
     ent_coef: str = "auto_0.005"
     """Initial weight of the entropy; it adapts."""
     target_entropy: float = 0.5
-    """Entropy of an action's distribution that the weight adapts to, at the begin of training: 0.5 is a standard
-    deviation of 0.3 in the pull's drive and 0.5 in the heater's."""
+    """Entropy of an action's distribution that the weight adapts to, at the begin of training; 0.5 is that of
+    two normal actions whose standard deviations have a geometric mean of 0.31."""
     entropy_fall: float = 0.0
     """Fall of it until the end."""
     action_noise_std: float = 0.0
@@ -383,7 +384,8 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base 
     if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer
         settings["learning_starts"] += done // recipe.action_repeat
         if recipe.action_noise_std:
-            settings["action_noise"] = NormalActionNoise(np.zeros(2), np.full(2, recipe.action_noise_std))
+            none = np.zeros(get_action_dim(env.action_space))
+            settings["action_noise"] = NormalActionNoise(none, none + recipe.action_noise_std)
     made: BaseAlgorithm = kind(policy, env, policy_kwargs=options, seed=seed, device="cpu", **settings)
     if isinstance(recipe, PPO):
         made.policy.log_std.requires_grad_(recipe.learn_std)

@@ -212,7 +212,7 @@ def _setting(text: str, recipe: TrainingConfig) -> tuple[str, Any]:
         typed = _typed(value, usual)
         if isinstance(usual, tuple) and Ellipsis not in get_args(known[name]) and len(typed) != len(usual):
             raise ValueError
-        if name in MOST and np.max(typed) > MOST[name]:
+        if name in MOST and not 0.0 <= np.min(typed) <= np.max(typed) <= MOST[name]:
             raise ValueError
         return name, typed
     except ValueError:
