@@ -1,4 +1,4 @@
-"""Callbacks of training recipes, for stable-baselines3's ``learn``: what makes the noise of learning smaller."""
+"""Callbacks and action noise of training recipes, for stable-baselines3: what makes the noise of learning smaller."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from torch.utils.hooks import RemovableHandle
 
 
@@ -126,3 +127,15 @@ class ClipErrors(BaseCallback):
     def _clipped(self, errors: torch.Tensor) -> torch.Tensor:
         most = errors.abs().quantile(self.quantile)
         return errors.clamp(-most, most)
+
+
+class NormalNoise(VectorizedActionNoise):
+    """Normal noise of ``num_envs`` actions of ``size`` entries; stable-baselines3's own draws action by action."""
+
+    def __init__(self, std: float, num_envs: int, size: int) -> None:
+        super().__init__(NormalActionNoise(np.zeros(size), np.full(size, std)), num_envs)
+        self.std, self.shape = std, (num_envs, size)
+
+    def __call__(self) -> np.ndarray:
+        """Draw the noise of all actions at once, shape (num_envs, size), in shares of the actions' range."""
+        return np.random.normal(0.0, self.std, self.shape).astype(np.float32)  # seeded by set_random_seed

@@ -18,7 +18,6 @@ import torch
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
@@ -34,7 +33,7 @@ from cz_gym.support.errors import CzError, require_type
 
 from . import apg
 from .asymmetric import AsymmetricPolicy, AsymmetricSACPolicy, LearnState, RememberingPolicy
-from .callbacks import ClipAdvantages, ClipErrors, FadeExploration
+from .callbacks import ClipAdvantages, ClipErrors, FadeExploration, NormalNoise
 from .contract import Contract, OnnxPolicy
 from .residual import Base, Residual
 
@@ -284,21 +283,22 @@ class SAC(Reinforcement):
     name: str = "sac"
     hidden: tuple[int, ...] = (32, 32)
     critic_hidden: tuple[int, ...] = (128, 128)
-    steps: int = 12_000_000
+    steps: int = 130_000_000
     action: str = "rate"
     gamma: float = 0.98
-    num_envs: int = 512
+    num_envs: int = 2048
     action_repeat: int = 4
     n_steps: int = 4
     fewest_updates: int = 4000
     buffer_size: int = 1_000_000
     learning_starts: int = 10_000
     """Actions before the first update."""
-    batch_size: int = 512
+    batch_size: int = 2048
     gradient_steps: int = 4
     """Updates after each action of all crystals."""
-    learning_rate: float = 5e-4
-    n_critics: int = 2
+    learning_rate: float = 1e-3
+    average: float = 0.02
+    n_critics: int = 1
     """Critics, of whose values the lower one counts. One takes half the time: twice as many updates fit into it."""
     tau: float = 0.01
     ent_coef: str = "auto_0.005"
@@ -306,12 +306,12 @@ class SAC(Reinforcement):
     target_entropy: float = 0.5
     """Entropy of an action's distribution that the weight adapts to, at the begin of training; 0.5 is that of
     two normal actions whose standard deviations have a geometric mean of 0.31."""
-    entropy_fall: float = 0.0
+    entropy_fall: float = 2.8
     """Fall of it until the end."""
-    action_noise_std: float = 0.0
+    action_noise_std: float = 0.1
     """Standard deviation of what training adds to the policy's actions, so that the critic sees what actions do while
     the policy's own become narrow."""
-    error_quantile: float = 1.0
+    error_quantile: float = 0.8
     """Quantile of the size of a batch's errors of the critics at which they are clipped; 1 clips none."""
 
     @property
@@ -384,8 +384,8 @@ def make_algorithm(recipe: TrainingConfig, seed: int, done: int = 0, base: Base 
     if isinstance(recipe, SAC):  # a resumed one first fills a new replay buffer
         settings["learning_starts"] += done // recipe.action_repeat
         if recipe.action_noise_std:
-            none = np.zeros(get_action_dim(env.action_space))
-            settings["action_noise"] = NormalActionNoise(none, none + recipe.action_noise_std)
+            size = recipe.num_envs, get_action_dim(env.action_space)
+            settings["action_noise"] = NormalNoise(recipe.action_noise_std, *size)
     made: BaseAlgorithm = kind(policy, env, policy_kwargs=options, seed=seed, device="cpu", **settings)
     if isinstance(recipe, PPO):
         made.policy.log_std.requires_grad_(recipe.learn_std)

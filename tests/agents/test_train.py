@@ -17,13 +17,15 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
+from stable_baselines3.common.utils import set_random_seed
 from tqdm import tqdm
 
 from cz_gym import CzEnv
 from cz_gym.agents import AgentFileError, OnnxPolicy, load, recipes
 from cz_gym.agents import train as training
 from cz_gym.agents.asymmetric import LearnState
-from cz_gym.agents.callbacks import AverageWeights, ClipAdvantages, ClipErrors
+from cz_gym.agents.callbacks import AverageWeights, ClipAdvantages, ClipErrors, NormalNoise
 from cz_gym.agents.recipes import CRYSTAL_RECIPES, MANY_STEPS, PPO, RECIPES, PPOResidual, make_algorithm
 from cz_gym.agents.train import CHECKPOINT, TrainingRun, load_checkpoint, restore, to_bytes
 from cz_gym.config import make_config
@@ -486,6 +488,15 @@ def test_sac_tries_wider_actions_than_its_policy_s():
     policy, wider = tried(0.0), tried(0.2)
     assert 0.1 < np.std(wider[0] - policy[0]) < 0.4
     assert np.abs(wider).max() <= 1.0
+
+
+def test_noise_of_all_crystals_in_one_draw_is_the_library_s_own():
+    def drawn(noise):
+        set_random_seed(3)
+        return [noise() for _ in range(2)]
+
+    each = VectorizedActionNoise(NormalActionNoise(np.zeros(2), np.full(2, 0.1)), 5)
+    np.testing.assert_array_equal(drawn(NormalNoise(0.1, 5, 2)), drawn(each))
 
 
 def test_a_critic_s_large_errors_are_clipped_and_the_actor_s_gradient_is_not():
