@@ -10,7 +10,7 @@ from cz_gym.evaluation.protocol import VALIDATION_SEEDS
 SMALL = PPO(num_envs=4, action_repeat=2, hidden=(16, 16), steps=128, n_steps=16, batch_size=32, n_epochs=1)
 SMALL_SAC = SAC(
     num_envs=4, hidden=(16, 16), steps=256, buffer_size=256, learning_starts=32, batch_size=16, gradient_steps=1
-)  # fmt: skip
+)
 SMALL_APG = APG(num_envs=4, window=20, steps=160)
 QUICK = PPO(
     num_envs=64, action_repeat=2, steps=32_000_000, n_steps=32, batch_size=1024, n_epochs=1, hidden=(16,),
